@@ -1,4 +1,4 @@
-"""A kit's block as STL and 3MF in millimetres, for slicers."""
+"""Writes a kit's block as STL and 3MF files in millimetres, for slicers."""
 
 import io
 import zipfile
@@ -50,16 +50,16 @@ xmlns="http://schemas.microsoft.com/3dmanufacturing/core/2015/02">
 
 
 def stl_bytes(surface: Triangles) -> bytes:
-    """A binary STL."""
+    """Encodes a triangle surface as a binary STL file."""
     data = trimesh.Trimesh(*surface, process=False).export(file_type="stl")
     assert isinstance(data, bytes)
     return data
 
 
 def threemf_bytes(surface: Triangles, title: str) -> bytes:
-    """A 3MF archive of one object, after the core specification 1.3.
+    """Encodes a triangle surface as a 3MF archive with one object (3MF core specification 1.3).
 
-    trimesh's own 3MF export needs lxml and writes no unit.
+    trimesh's own 3MF export is not used, because it needs lxml and writes no unit.
     """
     vertices, faces = surface
     corners = "\n".join(

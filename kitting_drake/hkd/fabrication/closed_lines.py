@@ -1,4 +1,4 @@
-"""Closed lines in true millimetres, for DXF and SVG."""
+"""Helpers that write closed polylines to DXF and SVG, in millimetres."""
 
 import io
 from collections.abc import Iterable
@@ -11,7 +11,7 @@ from kitting_drake.common.extras import import_extra
 
 
 def new_dxf() -> Any:
-    """An empty document of ezdxf, of release 2010 and in mm.
+    """Returns an empty ezdxf document of DXF release 2010, in mm.
 
     Raises:
         MachineError: ezdxf is not installed.
@@ -24,19 +24,20 @@ def new_dxf() -> Any:
 
 
 def add_layer(document: Any, name: str, colour: int, loops: Iterable[NDArray[np.float64]]) -> None:
-    """Adds a layer of closed polylines (n, 2); `colour` is AutoCAD's index."""
+    """Adds a layer of closed polylines, each (n, 2) in mm; `colour` is an AutoCAD colour index."""
     document.layers.add(name, color=colour)
     for loop in loops:
         document.modelspace().add_lwpolyline(loop.tolist(), close=True, dxfattribs={"layer": name})
 
 
 def text_of(document: Any) -> str:
-    """The content of a DXF file."""
+    """Returns the content of an ezdxf document as the text of a DXF file."""
     text = io.StringIO()
     document.write(text)
     return text.getvalue()
 
 
 def svg_path(loop: NDArray[np.float64]) -> str:
-    """The `d` of an SVG path through points (n, 2), with y down."""
+    """Returns the `d` attribute of an SVG path through points (n, 2) in mm, with y pointing
+    down."""
     return "M " + " L ".join(f"{x:.4f} {y:.4f}" for x, y in loop) + " Z"

@@ -1,4 +1,5 @@
-"""The design of a kit's block to print or mill: the simulated kit with notches and labels."""
+"""The design of a kit's block for printing or milling: the simulated kit with notches and
+labels."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -19,7 +20,7 @@ from kitting_drake.hkd.kits.parameters import KitParameters
 TEST_HOLE_MM = 20.0
 """The side of the hole of `test_piece`."""
 _ABOVE = 0.01
-"""The distance by which cutters stick out of the block, in metres."""
+"""How far the cutters stick out of the block, in metres, so that no thin skin remains."""
 _FINEST = 2e-6
 """The size of the smallest detail that the solid keeps, in metres."""
 _DIGITS = 4
@@ -37,11 +38,11 @@ class Design:
     notes: tuple[str, ...]
     """A sentence on each notch or label that found no room."""
     compensation: float = 0.0
-    """By how much the cavities are wider than those of `kit`, on each side, in metres."""
+    """How much wider the cavities are than those of `kit`, on each side, in metres."""
 
     @property
     def size_mm(self) -> tuple[float, float, float]:
-        """Length, width and height of the block."""
+        """The length, width and height of the block, in millimetres."""
         length, width, height = (round(1e3 * extent, _DIGITS) for extent in self.kit.size)
         return length, width, height
 
@@ -86,10 +87,11 @@ def design_kit(
 
 
 def solid(design: Design) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """The block's surface in the frame of the files; see `in_block`.
+    """Returns the block's surface in the frame of the files (see `in_block`).
 
     Returns:
-        Vertices (n, 3) in millimetres and triangles (m, 3), watertight and wound outward.
+        Vertices (n, 3) in millimetres and triangles (m, 3). The surface is watertight, and its
+        triangles are wound so that the normals point outward.
     """
     parameters = design.kit.parameters
     block = build_block(design.cavities, parameters)
@@ -97,7 +99,7 @@ def solid(design: Design) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         if recess.kind != "cavity":
             depth = parameters.height - recess.floor + _ABOVE
             block -= Manifold.extrude(recess.outline, depth).translate((0, 0, recess.floor))
-    # Remove details that rounding to the files' digits would collapse.
+    # Remove details that would collapse when coordinates are rounded to `_DIGITS` decimals.
     mesh = block.simplify(_FINEST).to_mesh64()
     corners = 1e3 * np.asarray(mesh.vert_properties, dtype=float)[:, :3]
     corners[:, :2] = in_block(corners[:, :2] / 1e3, parameters)
@@ -108,9 +110,14 @@ def solid(design: Design) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
 
 
 def test_piece() -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """A small plate with a square hole, to measure what a printer makes of it; see `solid`.
+    """Returns a small plate with a square hole, to measure how much too small a printer makes
+    holes.
 
-    Half of what the printed hole lacks to `TEST_HOLE_MM` is the compensation.
+    The side of the designed hole is `TEST_HOLE_MM`. The compensation to use is half the difference
+    between this and the side of the printed hole.
+
+    Returns:
+        The vertices and triangles, as in `solid`.
     """
     hole = TEST_HOLE_MM
     plate = Manifold.cube((hole + 12.0, hole + 12.0, 8.0))
@@ -130,12 +137,13 @@ def in_block(points: NDArray[np.float64], parameters: KitParameters) -> NDArray[
 
 
 def loops_mm(outline: CrossSection, parameters: KitParameters) -> list[NDArray[np.float64]]:
-    """The closed loops (n, 2) of an outline of the kit frame, converted by `in_block` to mm."""
+    """Returns the closed loops (n, 2) of an outline in mm, converted from the kit frame by
+    `in_block`."""
     return [in_block(np.asarray(loop), parameters) for loop in outline.to_polygons()]
 
 
 def layers(design: Design) -> dict[tuple[str, float], list[Recess]]:
-    """The recesses by kind and depth in mm, in drawing order."""
+    """Groups the recesses by kind and depth in mm, in drawing order."""
     groups: dict[tuple[str, float], list[Recess]] = {}
     for recess in design.recesses:
         groups.setdefault((recess.kind, design.depth_mm(recess)), []).append(recess)

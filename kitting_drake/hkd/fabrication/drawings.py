@@ -1,7 +1,7 @@
-"""The outlines of a block's recesses as DXF and SVG, in true millimetres.
+"""Draws the outlines of a block's recesses as DXF and SVG, in millimetres.
 
-Each layer or group holds the recesses of one kind and one depth below the block's top. Cavities
-are drawn along their walls; only the solids have the bevel around the rims.
+Each layer or group holds the recesses of one kind and one depth below the block's top. Cavities are
+drawn along their walls; only the STL and 3MF files have the bevel around the rims.
 """
 
 from html import escape
@@ -13,18 +13,21 @@ from kitting_drake.hkd.fabrication.closed_lines import add_layer, new_dxf, svg_p
 from kitting_drake.hkd.fabrication.design import Design, layers, loops_mm
 
 _NAMES = {"cavity": "CAVITIES", "notch": "NOTCHES", "label": "LABELS"}
-# AutoCAD's colour indices: cavities cycle through cool ones, notches and labels are warm.
+# AutoCAD's colour indices. Cavities cycle through cool colours; notches and labels are warm.
 _BLOCK_COLOUR, _CAVITY_COLOURS, _NOTCH_COLOUR, _LABEL_COLOUR = 7, (4, 3, 6, 2, 150, 80), 30, 1
 _STROKES = {"cavity": "#0b5fa5", "notch": "#d9480f", "label": "#2b8a3e"}
 
 
 def layer_name(kind: str, depth: float) -> str:
-    """The name of a layer, for instance `CAVITIES_17.62_MM_DEEP`."""
+    """Returns the name of a layer, for instance `CAVITIES_17.62_MM_DEEP`."""
     return f"{_NAMES[kind]}_{depth:.2f}_MM_DEEP"
 
 
 def dxf_text(design: Design) -> str:
-    """A DXF of release 2010: closed polylines on one layer per depth, and the block on BLOCK.
+    """Draws the recesses as a DXF of release 2010.
+
+    There is one layer of closed polylines for each kind and depth; the layer BLOCK has the block's
+    outline.
 
     Raises:
         MachineError: ezdxf is not installed.
@@ -48,7 +51,8 @@ def dxf_text(design: Design) -> str:
 
 
 def svg_text(design: Design) -> str:
-    """An SVG with 1 mm user units: a group per depth, a path per recess."""
+    """Draws the recesses as an SVG in units of 1 mm, with a group per depth and a path per
+    recess."""
     length, width, height = design.size_mm
     lines = [
         '<?xml version="1.0" encoding="UTF-8"?>',
@@ -80,5 +84,5 @@ def _block(design: Design) -> NDArray[np.float64]:
 
 
 def _path(loop: NDArray[np.float64], width: float) -> str:
-    """A closed path, flipped because y points down in SVG."""
+    """Returns a closed SVG path (n, 2); y is flipped, because it points down in SVG."""
     return svg_path(np.column_stack([loop[:, 0], width - loop[:, 1]]))

@@ -1,4 +1,4 @@
-"""`hkd kit`: writes all files of a kit into one folder, which appears atomically."""
+"""Writes all files of a kit into one folder, which appears atomically (`hkd kit`)."""
 
 import dataclasses
 import json
@@ -27,10 +27,10 @@ from kitting_drake.hkd.kits.parameters import KitParameters
 from kitting_drake.hkd.tools.tool import Tool, tool_names
 
 FITS = {"snug": 0.15, "easy": 0.35, "loose": 0.75}
-"""Clearances by name, as for foam and printed holders, in mm a side."""
+"""Named clearances between a tool and the wall, on each side, in mm."""
 
 RECORD = "kit.json"
-"""The file that marks a folder as a kit's."""
+"""The name of the file that marks a folder as a kit's."""
 
 _SCENARIO = """\
 # Written by `hkd kit`: the tools and the kit of this folder, for `python -m kitting_drake.run`.
@@ -45,29 +45,30 @@ Kit:
 
 @dataclass(frozen=True)
 class KitRequest:
-    """A kit to make. Lengths in mm."""
+    """A kit to make; lengths in mm."""
 
     tools: tuple[str, ...]
     """Names of tools, or paths of tool folders."""
     output: Path
     clearance_mm: float | None = None
-    """Between a tool and its cavity's wall. None: the template's 2."""
+    """The clearance between a tool and its cavity's wall. None: the template's 2 mm."""
     compensate_mm: float = 0.0
-    """By how much the printer or the router makes cavities too narrow, on each side. The files to
-    print and to cut have cavities wider by this; the simulated kit has not."""
+    """How much too narrow the printer or router makes cavities, on each side. The cavities in the
+    files to print and cut are wider by this; those of the simulated kit are not."""
     lead_in_mm: float | None = None
-    """The bevel of the rims. None: the template's 1."""
+    """The width of the bevel around the rims. None: the template's 1 mm."""
     wall_mm: float | None = None
     block_mm: tuple[float, float, float] | None = None
-    """Length, width and height. None: as small as possible, with the template's height."""
+    """The block's length, width and height. None: the smallest block found, with the template's
+    height."""
     notches: bool = False
     labels: bool = False
     robot: str = ""
-    """Lines of its scenario, in YAML; empty: the default robot."""
+    """YAML lines that set the robot in the kit's scenario; empty: the default robot."""
 
 
 def export_kit(request: KitRequest) -> Design:
-    """Writes the folder of a kit, and replaces a folder that this function wrote before.
+    """Writes the folder of a kit; replaces a folder written by an earlier call.
 
     Raises:
         UserError: the kit cannot be made, or the folder holds other files or cannot be written.
@@ -105,7 +106,7 @@ def export_kit(request: KitRequest) -> Design:
 
 
 def _parameters(request: KitRequest) -> KitParameters:
-    """The parameters of the requested kit.
+    """Builds the kit's parameters from a request.
 
     Raises:
         UserError: a length is out of range.
@@ -118,10 +119,10 @@ def _parameters(request: KitRequest) -> KitParameters:
         ("--compensate_mm", request.compensate_mm, -1.0, 1.0),
     ):
         if value is not None and not low <= value <= high:
-            raise UserError(f"{flag} {value:g} is out of range: give {low:g} to {high:g}")
+            raise UserError(f"{flag} is {value:g}, out of range: give {low:g} to {high:g}")
     if request.clearance_mm is not None:
         parameters.clearance = round(1e-3 * request.clearance_mm, 7)
-        # The outline's simplification must not use up a small clearance.
+        # Keep the outline's simplification small compared to the clearance.
         finest = max(parameters.clearance / 20, 1e-6)
         parameters.tolerance = min(parameters.tolerance, finest)
     if request.lead_in_mm is not None:
@@ -135,7 +136,7 @@ def _parameters(request: KitRequest) -> KitParameters:
         ):
             if not low <= value <= high:
                 raise UserError(
-                    f"--block_mm: a {name} of {value:g} is out of range: give {low:g} to {high:g}"
+                    f"--block_mm: the {name} is {value:g}, out of range: give {low:g} to {high:g}"
                 )
         parameters.length, parameters.width, parameters.height = (
             round(1e-3 * value, 7) for value in request.block_mm

@@ -1,4 +1,4 @@
-"""Engraved labels: each tool's name beside its cavity, or on the cavity's floor."""
+"""Engraves each tool's name beside its cavity, or on the cavity's floor."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -25,39 +25,39 @@ _CELL = 0.0007
 _FARTHEST = 0.03
 """The largest distance of a label from its cavity, in metres."""
 _PLAINLY = 1.5
-"""A label is at least this many times as far from other cavities as from its own."""
-# A label's cost, in metres, is a sum of three terms: minus 6 times the height of its letters; 6 mm
-# if it is read from the side; and a tenth of its distance from the cavity's middle.
+"""The least ratio of a label's distance from other cavities to that from its own cavity."""
+# The cost of a label's position, in metres, is a sum of three terms: minus 6 times the height of
+# its letters; 6 mm if the text is rotated; and a tenth of its distance from the cavity's middle.
 _DISTANCE_FOR_HEIGHT, _FROM_THE_SIDE, _OFF_THE_MIDDLE = 6.0, 0.006, 0.1
 _FONT_SIZE = 100.0
 
 
 @dataclass(frozen=True)
 class _Lettering:
-    """A text of one height with its lower left corner at the origin, in metres."""
+    """A text with letters of one height and its lower left corner at the origin, in metres."""
 
     outline: CrossSection
     cap_height: float
     rotated: bool
-    """Whether it is turned by 90 degrees."""
+    """Whether the text is turned by 90 degrees."""
 
     @property
     def size(self) -> tuple[float, float]:
-        """Extents along x and y."""
+        """The extents of the text along x and y, in metres."""
         _, _, x, y = self.outline.bounds()
         return x, y
 
 
 @dataclass(frozen=True)
 class _Raster:
-    """The grid of masks over the block: rows along y, columns along x."""
+    """A raster over the block on which masks are computed: rows along y, columns along x."""
 
     start: NDArray[np.float64]
     """(x, y) of the lower left corner, in metres."""
     counts: tuple[int, int]
 
     def mask(self, outline: CrossSection) -> NDArray[np.bool_]:
-        """The cells inside an outline."""
+        """Returns the mask (rows, columns) of the cells inside an outline."""
         if outline.is_empty():
             return np.zeros(self.counts, dtype=bool)
         return rasterized(outline, self.start, self.counts, _CELL)
@@ -105,7 +105,7 @@ def engrave_labels(
             continue
         floor = cavity.outline.offset(-_MARGIN, JoinType.Round) - notched
         inside = raster.mask(floor)
-        # Inside a cavity prefer the place furthest from the wall.
+        # Inside a cavity, prefer the place farthest from the wall.
         depth = ndimage.distance_transform_edt(inside) * _CELL
         bottom = _placed(choices, inside, raster, depth.max() - depth)
         if bottom is not None:
@@ -119,12 +119,12 @@ def engrave_labels(
 
 
 def _distance(mask: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """The distance of each cell from a mask, in metres."""
+    """Returns the distance of each cell from a mask, in metres."""
     return ndimage.distance_transform_edt(~mask) * _CELL
 
 
 def _from_middle(mask: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """The distance of each cell from the centre of a mask's bounding box, in metres."""
+    """Returns the distance of each cell from the centre of a mask's bounding box, in metres."""
     rows, columns = np.nonzero(mask)
     row, column = (rows.min() + rows.max()) / 2, (columns.min() + columns.max()) / 2
     y, x = np.indices(mask.shape)
@@ -137,13 +137,17 @@ def _placed(
     raster: _Raster,
     costs: NDArray[np.float64],
 ) -> CrossSection | None:
-    """The cheapest placement of a text whose bounding box is free, or None.
+    """Finds the cheapest placement of a text at which its bounding box is free.
 
     Args:
         choices: the same text at several sizes and rotations.
-        free: the cells that the text may cover.
+        free: (rows, columns) the cells that the text may cover.
         raster: the raster of the cells.
-        costs: the cost in metres of each position of the text's middle; infinite where forbidden.
+        costs: (rows, columns) the cost in metres of placing the text's middle in each cell;
+            infinite where that is forbidden.
+
+    Returns:
+        The outlines of the placed letters in the kit frame; None if no placement is free.
     """
     blocked = np.pad(np.cumsum(np.cumsum(~free, axis=0), axis=1), ((1, 0), (1, 0)))
     best, lowest = None, np.inf
@@ -173,7 +177,7 @@ def _placed(
 
 
 def _letterings(text: str) -> list[_Lettering]:
-    """A text at all heights to try, upright and turned by 90 degrees."""
+    """Lays out a text at each height to try, upright and turned by 90 degrees."""
     # matplotlib is slow to import, and only labels need it.
     from matplotlib.font_manager import FontProperties
     from matplotlib.textpath import TextPath

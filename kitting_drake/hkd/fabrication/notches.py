@@ -1,4 +1,4 @@
-"""Finger notches: half-round recesses beside a tool, to lift it out of its cavity by hand."""
+"""Cuts finger notches: half-round recesses beside a tool, to lift it out of its cavity by hand."""
 
 import itertools
 import math
@@ -68,7 +68,10 @@ def cut_notches(
 def _best_pair(
     kit: Kit, index: int, cavity: Cavity, free: CrossSection, wall: float
 ) -> list[CrossSection]:
-    """The outlines of a tool's notches, preferring two to one, wide to narrow, near to far."""
+    """Returns the outlines of a tool's notches, or an empty list if none fits.
+
+    Two notches are preferred to one, then wide to narrow, then near the grasp to far.
+    """
     single: list[CrossSection] = []
     # The order of the search is the order of preference, so the first pair is the best.
     for radius, slide in itertools.product(RADII, _SLIDES):
@@ -93,7 +96,17 @@ def _is_wall_between(one: CrossSection, other: CrossSection, cavity: Cavity, wal
 def _beside(
     kit: Kit, index: int, cavity: Cavity, slide: float
 ) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Points (2) on the cavity's wall on both sides of the grasp, and outward directions (2)."""
+    """Yields pairs of points on the cavity's walls on both sides of the grasp.
+
+    Args:
+        kit: the kit.
+        index: the index of the tool.
+        cavity: the tool's cavity.
+        slide: the distance from the grasp along the tool, in metres.
+
+    Yields:
+        A point (2) on the wall and the outward direction (2) there, in the kit frame.
+    """
     grasp, pose = kit.tools[index].grasp, kit.layout.poses[index]
     c, s = math.cos(pose.yaw), math.sin(pose.yaw)
     along_angle = pose.yaw + grasp.theta
@@ -126,7 +139,7 @@ def _crossings(
 def _half_disc(
     centre: NDArray[np.float64], outward: NDArray[np.float64], radius: float
 ) -> CrossSection:
-    """A disc about a point on the wall, cut off towards the opposite wall."""
+    """Returns a disc about a point on the wall, cut off half a radius inside the cavity."""
     disc = CrossSection.circle(radius, ARC_SEGMENTS)
     kept = CrossSection.square((1.5 * radius, 2 * radius)).translate((-0.5 * radius, -radius))
     angle = math.degrees(math.atan2(outward[1], outward[0]))
@@ -134,12 +147,13 @@ def _half_disc(
 
 
 def _notch(cavity: Cavity, disc: CrossSection, radius: float, wall: float) -> CrossSection | None:
-    """The outline of a notch, or None if it is not half round or leaves a thin fin."""
+    """Returns the outline of a notch, or None if it is not half round or leaves a thin fin."""
     beside = disc - cavity.outline
     share = beside.area() / (math.pi * radius**2 / 2)
     if len(beside.decompose()) != 1 or not _SHARES[0] <= share <= _SHARES[1]:
         return None
-    # A morphological closing fills thin gaps: little at two right-angled corners, more beside fins.
+    # A morphological closing fills thin gaps. It fills little area at two right-angled corners, and
+    # more beside thin fins.
     x_min, y_min, x_max, y_max = disc.bounds()
     near = CrossSection.square((x_max - x_min + 4 * wall, y_max - y_min + 4 * wall)).translate(
         (x_min - 2 * wall, y_min - 2 * wall)

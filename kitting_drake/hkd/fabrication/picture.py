@@ -1,4 +1,4 @@
-"""A picture of a kit from above: empty with depths and dimensions, and with its tools."""
+"""Draws a kit from above in two views: empty, with depths and dimensions; and with its tools."""
 
 import io
 from typing import Any
@@ -13,17 +13,17 @@ from kitting_drake.hkd.tools.tool import Tool
 
 _PAPER, _INK, _FAINT = "#f6f5f1", "#26282c", "#8a8d91"
 _TOP, _BEVEL, _ENGRAVED = "#2f3338", "#59606a", "#b9bec6"
-# Colours of shallow and deep floors, and of the shadow on them, as in two-colour tool foam.
+# Colours of shallow and deep floors, and of the shadows on them.
 _SHALLOW, _DEEP = np.array([0.98, 0.72, 0.26]), np.array([0.83, 0.43, 0.05])
 _SHADOW = (0.20, 0.08, 0.0)
 _LIGHT = np.array([-0.45, 0.55, 0.70]) / np.linalg.norm([-0.45, 0.55, 0.70])
-"""The unit vector towards the light."""
+"""The unit vector towards the light, in the kit frame."""
 _INCHES = 7.5
-"""The width of each of the two views."""
+"""The width of each of the two views, in inches."""
 
 
 def picture_png(design: Design) -> bytes:
-    """Draws the picture as a PNG."""
+    """Draws a picture of a kit's design, as a PNG."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -75,12 +75,12 @@ def _draw_block(axes: Any, design: Design) -> None:
         floor = (1 - share) * _SHALLOW + share * _DEEP
         _fill(axes, design, recess.outline, tuple(floor))
         depth = 1e-3 * design.depth_mm(recess)
-        # A cavity and its notches are open to each other: no wall between them casts a shadow.
+        # A cavity and its notches are drawn together, because no wall between them casts a shadow.
         opening = CrossSection()
         for other in order:
             if other.tool == recess.tool:
                 opening += other.outline
-        # Three hard shadows make a soft one.
+        # Draw three hard shadows, which together look like a soft one.
         for part in (0.25, 0.45, 0.65):
             offset = part * depth * _LIGHT[:2] / _LIGHT[2]
             lit = opening.translate((-float(offset[0]), -float(offset[1])))
@@ -98,12 +98,13 @@ def _fill(axes: Any, design: Design, outline: CrossSection, colour: Any, alpha: 
     loops = loops_mm(outline, design.kit.parameters)
     if loops:
         path = Path.make_compound_path(*(Path(np.vstack([a, a[:1]]), closed=True) for a in loops))
-        # `add_patch` would compute the patch's extent, which takes longer than drawing it.
+        # Not `add_patch`, because it also computes the patch's extent, which takes longer than
+        # drawing.
         axes.add_artist(PathPatch(path, facecolor=colour, edgecolor="none", alpha=alpha))
 
 
 def _draw_depths(axes: Any, design: Design) -> None:
-    """Writes the depth of each cavity where it has most room."""
+    """Writes each cavity's depth at the point farthest from the cavity's wall."""
     for cavity, recess in zip(design.cavities, design.recesses, strict=False):
         point = _roomiest_point(cavity.outline)
         x, y = 1e3 * (point + np.array(design.kit.size[:2]) / 2)
@@ -121,7 +122,7 @@ def _draw_depths(axes: Any, design: Design) -> None:
 
 
 def _roomiest_point(outline: CrossSection) -> NDArray[np.float64]:
-    """An approximation of the point (2) of an outline furthest from its boundary."""
+    """Returns an approximation of the point (2) of an outline farthest from its boundary."""
     distance = 0.032
     while distance > 1e-4:
         inner = outline.offset(-distance, JoinType.Round)
@@ -146,7 +147,7 @@ def _draw_measures(axes: Any, design: Design) -> None:
 
 
 def _draw_tool(axes: Any, design: Design, index: int) -> None:
-    """Draws the upward triangles of a seated tool, the highest last."""
+    """Draws the upward-facing triangles of a seated tool, the highest last."""
     from matplotlib.collections import PolyCollection
 
     tool, pose = design.kit.tools[index], design.kit.layout.poses[index]
@@ -163,7 +164,8 @@ def _draw_tool(axes: Any, design: Design, index: int) -> None:
 
 
 def _shaded(tool: Tool, yaw: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The upward triangles (n, 3, 3) of a tool in T, and their colours (n, 3)."""
+    """Returns the upward-facing triangles (n, 3, 3) of a tool in its frame T, and their colours (n,
+    3)."""
     triangles = tool.triangles
     normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)

@@ -15,4 +15,4 @@ class Recess:
     """The tool's name."""
     outline: CrossSection
     floor: float
-    """The height of the floor above the block's bottom."""
+    """The height of the recess's floor above the block's bottom, in metres."""

@@ -1,1 +1,1 @@
-"""Importing: tools from meshes and outlines."""
+"""Makes tools from meshes and outlines (`hkd import`)."""

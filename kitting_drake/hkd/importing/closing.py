@@ -1,4 +1,4 @@
-"""Closes the flat openings of a surface, for instance the underside of a scanned tool."""
+"""Closes the flat openings of a surface, for instance at the underside of a scanned tool."""
 
 import numpy as np
 from manifold3d import triangulate
@@ -7,27 +7,29 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Faces = NDArray[np.int64]
 
-# The rim of an opening may be this far from its plane: a scan's is not straight.
+# The largest distance of an opening's rim from the plane fitted to it, because the rims of scans
+# are not straight.
 _FLAT_MM = 2.0
 
 
 def capped(vertices: Array, faces: Faces) -> Faces | None:
     """Closes the openings of a surface with flat caps.
 
-    Rims in one plane are closed together, so that a ring stays a ring.
+    Openings in the same plane are closed together. A rim inside another therefore stays a hole, and
+    a ring stays a ring.
 
     Args:
         vertices: (n, 3), in mm, for a surface about 180 mm long.
-        faces: (m, 3), of consistent winding.
+        faces: (m, 3), consistently wound.
 
     Returns:
-        The triangles of the surface and the caps, or None if an opening is not flat or its rim
+        The triangles (k, 3) of the surface and the caps. None if an opening is not flat or its rim
         touches itself.
     """
     loops = _rims(faces)
     if not loops:
         return None
-    # The largest first: it sets the plane of those inside it.
+    # Start with the largest rim, because it sets the plane of the rims inside it.
     loops.sort(key=lambda loop: -float(np.linalg.norm(_area_vector(vertices[loop]))))
     caps = [faces]
     while loops:
@@ -50,10 +52,13 @@ def capped(vertices: Array, faces: Faces) -> Faces | None:
 
 
 def _rims(faces: Faces) -> list[NDArray[np.int64]]:
-    """The rims of the openings, each wound like its cap; none if a rim touches itself."""
+    """Returns the rims of the openings as vertex indices, each wound like its cap.
+
+    The list is empty if a rim touches itself.
+    """
     edges = np.vstack([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     known = set(map(tuple, edges.tolist()))
-    # The cap's edges run against those of the surface.
+    # The cap runs along each edge in the opposite direction to the surface.
     free = [(b, a) for a, b in known if (b, a) not in known]
     following = dict(free)
     if len(following) != len(free) or set(following) != set(following.values()):
@@ -70,6 +75,6 @@ def _rims(faces: Faces) -> list[NDArray[np.int64]]:
 
 
 def _area_vector(points: Array) -> Array:
-    """The normal of a closed polygon (n, 3), as long as its area."""
+    """Returns the normal (3,) of a closed polygon (n, 3), with the polygon's area as its length."""
     points = points - points.mean(axis=0)
     return np.cross(points, np.roll(points, -1, axis=0)).sum(axis=0) / 2

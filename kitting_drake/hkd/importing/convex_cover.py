@@ -6,30 +6,31 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-# Area (mm^2) below which outlines count as equal.
+# Area (mm^2) below which two outlines count as equal.
 _AREA = 0.02
-# Cuts to try: through this many corners, at this many angles.
+# The number of points through which to try a cut, and the number of angles at each point.
 _CORNERS, _ANGLES = 6, 8
 _FAR = 1e3
-# Cells smaller than this are not cut again; nor is any cell once there are this many.
+# Cells smaller than the first number are not cut again. Cutting stops at the second number of
+# cells.
 _SMALLEST_MM, _MOST_CELLS = 1.0, 150
-# Steps in which the edges of the final polygons are moved outward.
+# Steps by which the edges of the final polygons are moved outward, in turn.
 _PUSHES_MM = (0.8, 0.4, 0.2, 0.1)
 
 
 def convex_cover(
     inner: CrossSection, outer: CrossSection, outline: CrossSection
 ) -> list[CrossSection]:
-    """Convex polygons that cover `inner` and stay within `outer`. Deterministic.
+    """Covers the region `inner` with convex polygons that stay within `outer`.
 
-    The inner region is cut into cells whose hulls are within the outer one. Hulls are grown from
-    the cells, and those that cover most are selected. Between the two regions the polygons follow
-    `outline` as closely as they can.
+    The inner region is cut into cells whose hulls are within the outer region. Larger hulls are
+    grown from the cells, and those that cover most are selected. Finally the edges of the polygons
+    are moved to match `outline` as closely as possible. The result is deterministic.
 
     Args:
         inner: the region to cover, without holes.
         outer: the allowed region; it contains `inner`.
-        outline: the preferred region, between the two.
+        outline: the preferred region, between the other two.
     """
     cells = _cells(inner, outer)
     grown = [_grown(seed, cells, outer) for seed in range(len(cells))]
@@ -53,7 +54,7 @@ def _fits(profile: CrossSection, outer: CrossSection) -> bool:
 
 
 def _cells(inner: CrossSection, outer: CrossSection) -> list[CrossSection]:
-    """Cuts `inner` into parts whose hulls are within `outer`."""
+    """Cuts the region `inner` into parts whose hulls are within `outer`."""
     done: list[CrossSection] = []
     waiting = inner.decompose()
     while waiting:
@@ -73,7 +74,7 @@ def _corners(profile: CrossSection) -> Array:
 
 
 def _best_cut(part: CrossSection, outer: CrossSection) -> list[CrossSection]:
-    """Cuts a part where the hulls of its pieces have the least area outside `outer`."""
+    """Cuts a part so that the hulls of its pieces have the least area outside `outer`."""
     best, least = [part.hull()], np.inf
     for point in _notches(part):
         for angle in np.arange(_ANGLES) * 180.0 / _ANGLES:
@@ -88,7 +89,10 @@ def _best_cut(part: CrossSection, outer: CrossSection) -> list[CrossSection]:
 
 
 def _notches(part: CrossSection) -> list[Array]:
-    """The centre of a part, and separate corners of it that lie deepest inside its hull."""
+    """Returns the centre of a part, and those of its corners that lie deepest inside its hull.
+
+    The corners are at some distance from each other.
+    """
     corners = _corners(part)
     hull = _corners(part.hull())
     edges = np.roll(hull, -1, axis=0) - hull
@@ -96,7 +100,8 @@ def _notches(part: CrossSection) -> list[Array]:
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     depth = ((hull * normals).sum(axis=1) - corners @ normals.T).min(axis=1)
     spacing = 0.1 * np.ptp(corners, axis=0).max()
-    # Try the centre first. Where all cuts of an arc are equally good, halves give fewest cells.
+    # Try the centre first. If all cuts of an arc are equally good, cutting it in half gives the
+    # fewest cells.
     chosen = [0.5 * (corners.min(axis=0) + corners.max(axis=0))]
     for index in np.argsort(-depth, kind="stable"):
         if all(np.linalg.norm(corners[index] - other) > spacing for other in chosen[1:]):
@@ -107,7 +112,7 @@ def _notches(part: CrossSection) -> list[Array]:
 
 
 def _grown(seed: int, cells: list[CrossSection], outer: CrossSection) -> set[int]:
-    """Grows a hull within `outer` from a seed by the least added area; returns its cells."""
+    """Grows a hull within `outer` from one cell, by the least added area; returns its cells."""
     hull, members, candidates = cells[seed].hull(), {seed}, set(range(len(cells))) - {seed}
     while True:
         trials = []
@@ -115,7 +120,7 @@ def _grown(seed: int, cells: list[CrossSection], outer: CrossSection) -> set[int
             joined = _hull([hull, cells[i]])
             trials.append((joined.area() - hull.area() - (cells[i] - hull).area(), i, joined))
         for _, i, joined in sorted(trials, key=lambda trial: trial[:2]):
-            # The hull only grows, so a cell that does not fit here never will.
+            # The hull only grows, so a cell that does not fit at this step never will.
             candidates.discard(i)
             if _fits(joined, outer):
                 hull = joined
@@ -126,7 +131,7 @@ def _grown(seed: int, cells: list[CrossSection], outer: CrossSection) -> set[int
 
 
 def _pushed(polygon: CrossSection, outline: CrossSection, outer: CrossSection) -> CrossSection:
-    """Moves edges of a polygon outward where that makes it match the outline better."""
+    """Moves edges of a polygon outward where this makes it match the outline better."""
     corners = _corners(polygon.simplify(0.05))
     edges = np.roll(corners, -1, axis=0) - corners
     normals = np.column_stack([edges[:, 1], -edges[:, 0]])
@@ -134,7 +139,7 @@ def _pushed(polygon: CrossSection, outline: CrossSection, outer: CrossSection) -
     offsets = (corners * normals).sum(axis=1)
 
     def score(candidate: CrossSection) -> float:
-        """The area inside the outline minus the area outside it."""
+        """Returns the area inside the outline minus the area outside it."""
         return float(2 * (candidate ^ outline).area() - candidate.area())
 
     best, best_score = polygon, score(polygon)
@@ -149,7 +154,7 @@ def _pushed(polygon: CrossSection, outline: CrossSection, outer: CrossSection) -
 
 
 def _between(normals: Array, offsets: Array) -> CrossSection:
-    """The region of points p with normals @ p <= offsets."""
+    """Returns the region of the points p (2,) with normals @ p <= offsets."""
     result = CrossSection.square((_FAR, _FAR), True)
     for (x, y), offset in zip(normals, offsets, strict=True):
         half = CrossSection.square((_FAR, 2 * _FAR)).translate((offset, -_FAR))
@@ -158,7 +163,7 @@ def _between(normals: Array, offsets: Array) -> CrossSection:
 
 
 def _needed(polygons: list[CrossSection], inner: CrossSection) -> list[CrossSection]:
-    """Drops polygons, smallest first, that the others make superfluous."""
+    """Drops the polygons that the others make superfluous, smallest first."""
     kept = list(polygons)
     for polygon in sorted(polygons, key=CrossSection.area):
         rest = [other for other in kept if other is not polygon]

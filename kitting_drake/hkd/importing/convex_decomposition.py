@@ -1,9 +1,9 @@
-"""Approximate convex decomposition of any solid for collision. Lengths in mm.
+"""Approximate convex decomposition of any solid for collision. Lengths are in mm.
 
-Hydroelastic contact costs time per hull and per facet, so both have a budget. The first hulls cover
-the outline seen from above (`convex_cover`), because it decides whether the tool enters its cavity.
-The rest of the budget refines the heights. Every hull has only points of the solid, so the tool
-rests on a table as the solid does.
+Hydroelastic contact costs time per hull and per facet, so both are limited. The first hulls cover
+the outline as seen from above (`convex_cover`), because the outline decides whether the tool enters
+its cavity. The remaining hulls refine the heights. All vertices of a hull are points of the solid,
+so the tool rests on a table as the solid does.
 """
 
 from dataclasses import dataclass
@@ -19,19 +19,20 @@ from kitting_drake.hkd.tools.solids import SEGMENTS
 from systems.grasp import Grasp
 
 MOST_HULLS = 16
-"""The number of hulls of a tool, unless its outline needs more at the last of
-`OUTLINE_TOLERANCES_MM`."""
+"""The largest number of hulls of a tool. It is exceeded only if the outline needs more even at the
+last of `OUTLINE_TOLERANCES_MM`."""
 OUTLINE_TOLERANCES_MM = ((0.26, 0.12), (0.30, 0.2), (0.4, 0.2), (0.6, 0.3), (0.9, 0.3))
-"""Tolerances of the hulls for the outline and for the gripped faces, before vertices are thinned.
-Each pair is tried if the one before needs too many hulls."""
+"""Pairs of tolerances of the hulls, for the outline and for the gripped faces, before vertices are
+thinned. A pair is tried if the one before it needs too many hulls."""
 ADDED_SHARE = 0.05
-"""The share of the tool's volume that one hull may add above and below the tool."""
-# Vertices are thinned at the first tolerance that leaves at most this many, or at the last one. The
-# outline has its own tolerance.
+"""The largest volume that one hull may add above and below the tool, as a share of the tool's
+volume."""
+# Vertices are thinned with the first tolerance that leaves at most `_MOST_VERTICES`, or else with
+# the last one. The outline has its own tolerance.
 _MOST_VERTICES = 20
 _VERTEX_TOLERANCES_MM = (0.2, 0.3, 0.45, 0.6)
 _OUTLINE_VERTEX_TOLERANCE_MM = 0.08
-# Hulls may bridge notches narrower than twice this, because cavities do too.
+# Half the width of the notches that hulls may bridge. Cavities bridge them too.
 _NOTCH_MM = 2.0
 _SMALLEST_VOLUME = 0.5
 
@@ -43,7 +44,7 @@ class Decomposition:
     hulls: list[np.ndarray]
     """The vertices (n, 3) of each hull, in mm."""
     outline_deviation_mm: float
-    """The largest distance between their outline from above and the solid's, capped at 5 mm."""
+    """The largest distance between the hulls' outline from above and the solid's, at most 5 mm."""
 
 
 def decompose(solid: Manifold, grasp: Grasp) -> Decomposition:
@@ -70,7 +71,7 @@ def decompose(solid: Manifold, grasp: Grasp) -> Decomposition:
         try:
             hulls.append(_thinned(np.asarray(part.hull().to_mesh64().vert_properties)[:, :3]))
         except QhullError:
-            # The part has no volume once its vertices are on the grid.
+            # Rounding to the grid may leave a part without volume.
             continue
     hulls.sort(key=lambda hull: tuple(np.round(hull.mean(axis=0), 3)))
     return Decomposition(hulls, _deviation(hulls, outline))
@@ -93,7 +94,8 @@ def _within(solid: Manifold, polygon: CrossSection) -> Manifold:
 
 
 def _split_by_height(parts: list[Manifold]) -> list[Manifold]:
-    """Cuts the parts whose hulls add the most volume in two, as the budget of hulls allows."""
+    """Cuts in two the parts whose hulls add the most volume, as far as the number of hulls
+    allows."""
     parts = [part for part in parts if part.volume() >= _SMALLEST_VOLUME]
     most = ADDED_SHARE * sum(part.volume() for part in parts)
     added = [_added_volume(part) for part in parts]
@@ -120,7 +122,8 @@ def _thinned(points: np.ndarray) -> np.ndarray:
 
 
 def _halves(part: Manifold) -> tuple[Manifold, Manifold]:
-    """Cuts a part by an axis-aligned plane such that the halves' hulls have the least volume."""
+    """Cuts a part by an axis-aligned plane so that the hulls of the halves have the least
+    volume."""
     low, high = np.array(part.bounding_box()).reshape(2, 3)
     size = high - low
     vertices = np.asarray(part.to_mesh64().vert_properties)[:, :3]
@@ -132,7 +135,7 @@ def _halves(part: Manifold) -> tuple[Manifold, Manifold]:
             normal = np.eye(3)[axis]
             halves = part.split_by_plane(tuple(normal), low[axis] + share * size[axis])
             volume = sum(half.hull().volume() for half in halves)
-            # Of cuts that are equally good, prefer the one nearest to the middle.
+            # Among equally good cuts, prefer the one nearest to the middle.
             volume *= 1.0 + 0.02 * abs(share - 0.5)
             if volume < best_volume:
                 best, best_volume = halves, volume
@@ -141,12 +144,13 @@ def _halves(part: Manifold) -> tuple[Manifold, Manifold]:
 
 
 def _steps(shares: np.ndarray) -> list[float]:
-    """Positions, 0 to 1, of planes with many vertices, such as a shoulder or a jaw's end."""
+    """Returns positions (0 to 1) of planes that hold many vertices, such as a shoulder or a jaw's
+    end."""
     within = shares[(shares > 0.08) & (shares < 0.92)]
     values, counts = np.unique(np.round(within, 3), return_counts=True)
     order = np.argsort(-counts, kind="stable")[:3]
     many = max(4, len(shares) // 50)
-    # The median of the vertices' exact positions, not the rounded one.
+    # Use the median of the vertices' exact positions instead of the rounded position.
     return [
         float(np.median(within[np.abs(within - values[i]) <= 6e-4]))
         for i in order

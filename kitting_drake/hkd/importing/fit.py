@@ -17,33 +17,35 @@ from systems.grasp import Grasp
 
 THINNEST_MM, HIGHEST_MM = 4.0, 45.0
 
-# The number of other grasps to keep, and how much more they may cost than the best.
+# The number of other grasps to keep, and the largest cost above that of the best grasp.
 _OTHERS, _MUCH_WORSE = 3, 2.0
 
 UNITS_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "inches": 25.4}
-"""The units in which a mesh may be, in mm."""
+"""The length in mm of each unit that a mesh may use."""
 _CREASE_ANGLE_DEG = 35.0
-# Decimation tolerances to try until a mesh has few enough triangles.
+# Decimation tolerances, tried in turn until the mesh has at most `_ENOUGH_TRIANGLES`.
 _DECIMATION_TOLERANCES_MM, _ENOUGH_TRIANGLES = (0.01, 0.02, 0.04), 10_000
 
 
 def material_of(category: str) -> str:
-    """The material to draw an imported tool with: a key of `hkd.tools.solids.MATERIALS`."""
+    """Returns the material with which an imported tool is drawn, a key of
+    `hkd.tools.solids.MATERIALS`."""
     return "polished_steel" if category == "wrench" else "steel"
 
 
 def true_length(
     length: float, height: float, unit: str | None, wanted_mm: float | None
 ) -> tuple[float, str]:
-    """The length of a tool in mm, and a phrase for the user that explains it.
+    """Returns the length of a tool in mm, and a phrase for the user that explains it.
 
-    Meshes have no unit. But few units make a tool that the hand can hold and a kit can take.
+    Meshes often have no unit. The unit is then the only one in which the hand can hold the tool and
+    a kit has room for it.
 
     Args:
-        length: of the tool at rest, in the unit of its file.
-        height: likewise.
-        unit: a key of `UNITS_MM` that the user or the file gives.
-        wanted_mm: the length to scale to.
+        length: the length of the tool at rest, in the unit of its file.
+        height: the height of the tool at rest, in the unit of its file.
+        unit: a key of `UNITS_MM` that the user or the file gives; None if unknown.
+        wanted_mm: the length to scale to, or None.
 
     Raises:
         UserError: several units are possible, or none, or the tool is too short or too long.
@@ -61,7 +63,7 @@ def true_length(
         return real, f"in {unit}: {real:.1f} mm long"
     lengths = {name: length * mm for name, mm in UNITS_MM.items()}
     units = [name for name, real in lengths.items() if SHORTEST_MM <= real <= LONGEST_MM]
-    # A unit that makes it too thin or too high counts only if no other does better.
+    # Drop the units in which the tool is too thin or too high, unless it is so in all units.
     units = [u for u in units if THINNEST_MM <= height * UNITS_MM[u] <= HIGHEST_MM] or units
     if len(units) == 1:
         return lengths[units[0]], f"taken to be in {units[0]}: {lengths[units[0]]:.1f} mm long"
@@ -83,10 +85,10 @@ def fit(
     directory: Path,
     density: float | None = None,
 ) -> tuple[Tool, Manifold]:
-    """Makes a tool of a length (mm), and writes its visual mesh.
+    """Makes a tool of a given length in mm, and writes its visual mesh.
 
     Raises:
-        UserError: the hand cannot hold it, or no kit can take it.
+        UserError: the hand cannot hold the tool, or a kit has no room for it.
     """
     factor = length / size(solid)[0]
     scaled = centred(_decimated(solid.scale((factor, factor, factor))))
@@ -97,7 +99,7 @@ def fit(
 
 
 def _decimated(solid: Manifold) -> Manifold:
-    """Removes triangles that hardly show, and coarsens a very fine mesh."""
+    """Removes triangles that make little visible difference, and coarsens a very fine mesh."""
     simple = solid
     for tolerance in _DECIMATION_TOLERANCES_MM:
         simple = solid.simplify(tolerance)
@@ -126,7 +128,7 @@ def _tool(
     """Writes the visual mesh of a solid and finds its best grasp.
 
     Raises:
-        UserError: the hand cannot hold it.
+        UserError: the hand cannot hold the tool.
     """
     length, width, height = (round(1e-3 * float(extent), 6) for extent in size(solid))
     visual = directory / f"{material_of(category)}.obj"
@@ -137,8 +139,8 @@ def _tool(
     proposals = propose_grasps(triangles, com)
     if not proposals:
         raise UserError(
-            f"at a length of {1e3 * length:.0f} mm the hand cannot hold it from above (the jaws "
-            f"hold at most {1e3 * WIDEST:.0f} mm)"
+            f"at a length of {1e3 * length:.0f} mm the hand cannot hold the tool from above (the "
+            f"jaws open to at most {1e3 * WIDEST:.0f} mm)"
         )
     return Tool(
         directory=directory,
@@ -156,9 +158,10 @@ def _tool(
 
 
 def other_grasps(proposals: list[GraspProposal]) -> tuple[Grasp, ...]:
-    """The grasps to try after the first of `propose_grasps`, best first.
+    """Selects the grasps to try after the first of `propose_grasps`, best first.
 
-    The nearest to the centre of mass is always among them, for a tool that turns between the pads.
+    The grasp nearest to the centre of mass is always selected, because a tool that is held there
+    does not turn between the pads.
     """
     usable = [item for item in proposals[1:] if item.cost < proposals[0].cost + _MUCH_WORSE]
     chosen = usable[:_OTHERS]
@@ -169,5 +172,5 @@ def other_grasps(proposals: list[GraspProposal]) -> tuple[Grasp, ...]:
 
 
 def grasp_record(grasp: Grasp) -> dict[str, float]:
-    """A grasp as in `tool.yaml`."""
+    """Returns a grasp as it is written to `tool.yaml`."""
     return {key: round(float(value), 6) for key, value in vars(grasp).items()}

@@ -25,34 +25,35 @@ class ImportRequest:
     mesh: Path
     category: str
     name: str | None = None
-    """The tool's name; by default the file's."""
+    """The tool's name; None takes the file's name."""
     length_mm: float | None = None
-    """The length to scale to; None keeps the true length."""
+    """The length in mm to scale to; None keeps the true length."""
     unit: str | None = None
     """The unit of the file, a key of `fit.UNITS_MM` or, for outlines, of `drawn_curves.UNITS_MM`;
-    None finds it."""
+    None finds the unit."""
     mass_g: float | None = None
-    """The mass as weighed; None follows from the densities."""
+    """The weighed mass in grams; None computes it from the densities."""
     material: str | None = None
     """The material of the whole tool, a key of `materials.MATERIALS`."""
     density: float | None = None
-    """The mean density in kg/m^3; see `materials` for None."""
+    """The mean density in kg/m^3; None takes that of the category (see `materials`)."""
     output: Path | None = None
-    """The folder of tools to write to; by default `user_tools`."""
+    """The folder of tools to write to; None: `user_tools`."""
     height_mm: float | None = None
-    """The height of an extruded outline; only for outlines."""
+    """The height in mm to which an outline is extruded. A mesh has none."""
 
     @property
     def given_density(self) -> float | None:
-        """The density of the whole tool in kg/m^3, by itself or by the material."""
+        """The density of the whole tool in kg/m^3, given by `density` or `material`; None if
+        neither is."""
         return self.density if self.material is None else MATERIALS[self.material]
 
 
 def check_request(request: ImportRequest) -> None:
-    """Checks all but the name.
+    """Checks all options but the name.
 
     Raises:
-        UserError: an option is out of range, unknown, or does not go with another or the file.
+        UserError: an option is out of range or unknown, or contradicts another option or the file.
     """
     check_category(request.category)
     for flag, value, low, high in (
@@ -62,7 +63,7 @@ def check_request(request: ImportRequest) -> None:
         ("--height_mm", request.height_mm, THINNEST_MM, HIGHEST_MM),
     ):
         if value is not None and not low <= value <= high:
-            raise UserError(f"{flag} {value:g} is out of range: give {low:g} to {high:g}")
+            raise UserError(f"{flag} is {value:g}, out of range: give {low:g} to {high:g}")
     units = drawn_curves.UNITS_MM if is_outline(request.mesh) else UNITS_MM
     for flag, name, names in (
         ("--unit", request.unit, units),
@@ -71,20 +72,23 @@ def check_request(request: ImportRequest) -> None:
         if name is not None and name not in names:
             raise UserError(f"{flag} '{name}' is not known: give {', '.join(names)}")
     if request.unit is not None and request.mesh.suffix.lower() in IN_MM:
-        raise UserError(f"{request.mesh} names its unit: leave out --unit, or give --length_mm")
+        raise UserError(
+            f"{request.mesh} states its own unit: leave out --unit, or give --length_mm"
+        )
     if request.material is not None and request.density is not None:
         raise UserError("--material and --density both give the density: leave out one")
     if is_outline(request.mesh) and request.height_mm is None:
-        raise UserError(f"{request.mesh} is an outline: give its height with --height_mm")
+        raise UserError(f"{request.mesh} is an outline: give the tool's height with --height_mm")
     if not is_outline(request.mesh) and request.height_mm is not None:
         raise UserError(f"--height_mm is for outlines (SVG, DXF), and {request.mesh} is a mesh")
 
 
 def checked_name(request: ImportRequest) -> str:
-    """The tool's name: the one asked for, or the file's.
+    """Returns the tool's name: the requested one, or the file's.
 
     Raises:
-        UserError: it is not a name, or belongs to one of the project's own tools.
+        UserError: the name has other characters than lower-case letters, digits and underscores, or
+            belongs to one of the project's own tools.
     """
     if request.name is None:
         name = re.sub(r"[^a-z0-9]+", "_", request.mesh.stem.lower()).strip("_")[:60]
@@ -93,7 +97,9 @@ def checked_name(request: ImportRequest) -> str:
     else:
         name = request.name
     if not re.fullmatch(r"[a-z0-9][a-z0-9_]{0,63}", name):
-        raise UserError(f"--name '{name}' must be small letters, digits and underscores")
+        raise UserError(
+            f"--name '{name}' must consist of lower-case letters, digits and underscores"
+        )
     if name in tool_names():
         raise UserError(f"'{name}' is the name of one of the project's own tools: give --name")
     return name

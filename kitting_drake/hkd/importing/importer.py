@@ -1,10 +1,12 @@
-"""`hkd import`: makes a tool from a mesh or an outline.
+"""Makes a tool from a mesh or an outline (`hkd import`).
 
-The mesh is read and repaired (`repair`) or extruded from an outline (`outline`). It is brought into
-the tool frame in a stable pose (`tool_frame`), scaled, and given a grasp (`fit`), a mass
-(`materials`) and collision hulls (`convex_decomposition`). Finally a simulation checks how it comes
-to rest (`resting_pose`). All this happens in a child process, which may crash or hang, and the
-tool's folder appears atomically. Solids are handled in mm and written in metres.
+1. A mesh is read and repaired (`repair`), or an outline is extruded (`outline`).
+2. The solid is moved to the tool frame, in a stable pose (`tool_frame`), and scaled.
+3. It gets a grasp (`fit`), a mass (`materials`) and collision hulls (`convex_decomposition`).
+4. A simulation checks in which pose it comes to rest (`resting_pose`).
+
+All this happens in a child process, because geometry libraries may crash or hang on broken meshes.
+The tool's folder appears atomically. Solids are handled in mm and written in metres.
 """
 
 import contextlib
@@ -30,13 +32,13 @@ _MAKING = ".making-"
 
 @dataclass(frozen=True)
 class ImportReport:
-    """The tool that was made."""
+    """A report on a tool that was made."""
 
     directory: Path
     record: dict[str, Any]
     """The tool's record, as in `tool.yaml`."""
     notes: list[str]
-    """The assumptions and repairs, one phrase each."""
+    """Phrases for the user on assumptions and repairs."""
     collision_hulls: int
     """The number of collision hulls."""
 
@@ -45,11 +47,12 @@ def import_tool(request: ImportRequest, time_limit: float | None = TIME_LIMIT) -
     """Makes a tool's folder from a mesh or an outline.
 
     Args:
-        request: the file to import.
-        time_limit: seconds of processor time of the child process; None runs in this process.
+        request: the file to import, and the properties of the tool.
+        time_limit: the processor time of the child process in seconds; None imports in this
+            process.
 
     Raises:
-        UserError: the tool cannot be made; nothing was written then.
+        UserError: the tool cannot be made; nothing is written then.
     """
     check_request(request)
     name = checked_name(request)
@@ -69,7 +72,7 @@ def import_tool(request: ImportRequest, time_limit: float | None = TIME_LIMIT) -
                 if time_limit is None
                 else prepare_aside(request, name, made, time_limit)
             )
-            # Another run may have made it in the meantime.
+            # Check again, because another process may have made the folder in the meantime.
             replaced = _check_replaceable(final, request) if final.exists() else None
             replace_folder(final, made, Path(scratch) / "replaced")
             record, notes, hulls = report
@@ -85,20 +88,23 @@ def import_tool(request: ImportRequest, time_limit: float | None = TIME_LIMIT) -
 
 
 def _remove_abandoned(folder: Path) -> None:
-    """Removes unfinished folders of killed imports."""
+    """Removes the unfinished folders that killed imports left behind."""
     for path in folder.glob(f"{_MAKING}*"):
-        # Another import may remove the folder at the same time.
+        # Ignore errors, because another import may remove the folder at the same time.
         with contextlib.suppress(FileNotFoundError):
             if time.time() - path.stat().st_mtime > 2 * MOST_WAITING * TIME_LIMIT:
                 shutil.rmtree(path, ignore_errors=True)
 
 
 def _check_replaceable(folder: Path, request: ImportRequest) -> str | None:
-    """Checks that a folder may be replaced; returns a note if the file's content has changed.
+    """Checks that a folder may be replaced.
+
+    Returns:
+        A note for the user if the content of the imported file has changed; else None.
 
     Raises:
-        UserError: the folder is not an imported tool, comes from a file of another name, or has an
-            annotated grasp.
+        UserError: the folder is not an imported tool, comes from a file of another name, or has a
+            grasp that the user saved.
     """
     try:
         record = yaml.safe_load((folder / "tool.yaml").read_text())
@@ -109,9 +115,13 @@ def _check_replaceable(folder: Path, request: ImportRequest) -> str | None:
             f"{folder} exists and is not an imported tool: give another --name"
         ) from error
     if annotated:
-        raise UserError(f"{folder} has a grasp that you saved: give another --name, or delete it")
+        raise UserError(
+            f"{folder} has a grasp that you saved: give another --name, or delete the folder"
+        )
     if file != request.mesh.name:
-        raise UserError(f"{folder} is the tool of {file}: give another --name, or delete it")
+        raise UserError(
+            f"{folder} is the tool of {file}: give another --name, or delete the folder"
+        )
     if request.mesh.is_file() and digest != digest_of(request.mesh):
-        return f"replaces the tool of an older {file}"
+        return f"replaces the tool of an older version of {file}"
     return None

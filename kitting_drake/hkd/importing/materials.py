@@ -1,7 +1,8 @@
 """The mass distribution of an imported tool.
 
-A mesh has no materials. But the head of a hammer and the blade of a screwdriver are of steel and
-their handles are light, so their centre of mass is not the centroid.
+A mesh does not state materials. This module assumes that the head of a hammer and the blade of a
+screwdriver are of steel, and that their handles are lighter. The centre of mass is then not the
+centroid of the volume.
 """
 
 import numpy as np
@@ -23,7 +24,7 @@ MATERIALS = {
     "plastic": 1150.0,
     "rubber": 1200.0,
 }
-"""The densities of the materials that a whole tool may be of, in kg/m^3."""
+"""The densities in kg/m^3 of the materials that `--material` accepts."""
 
 DENSITIES = {"pliers": 6000.0, "wrench": _STEEL}
 """The mean density of a category's tools with their grips, in kg/m^3."""
@@ -31,46 +32,46 @@ OTHER_DENSITY = 3000.0
 """The mean density of a tool of any other category, in kg/m^3."""
 
 DENSITY_RANGE = (50.0, 25_000.0)
-"""The possible mean densities of a tool, in kg/m^3."""
+"""The least and the largest mean density of a tool, in kg/m^3."""
 
 _SLICES = 60
 _END = 0.3
-"""The share of the length that counts as an end."""
+"""The length of an end, as a share of the tool's length."""
 _STEP_WIDTH = 1.5
-"""The least ratio of a head's or handle's width to the shaft's."""
+"""The least ratio of the width of a head or handle to that of the shaft."""
 
 
 def bodies_of(solid: Manifold, category: str, density: float | None = None) -> list[Body]:
     """Splits a tool in its frame T into one or two homogeneous bodies.
 
-    The head of a hammer or the blade of a screwdriver is of steel and the rest is a handle, if
-    their widths differ clearly.
+    If their widths differ clearly, the head of a hammer or the blade of a screwdriver is one body,
+    of steel, and the handle is the other.
 
     Args:
-        solid: in mm, with the working end toward +x.
+        solid: the tool in mm, with its working end toward +x.
         category: the category of the tool.
         density: the density of the whole tool, in kg/m^3; by default that of the category.
     """
     if density is None and category in ("hammer", "screwdriver"):
         border = _border(solid, category)
         if border is not None:
-            # The first half is the one toward the normal: the working end.
+            # The normal points to the first of the two parts: the working end.
             front, back = solid.split_by_plane((1.0, 0.0, 0.0), border)
             return [(front, _STEEL), (back, _HANDLE)]
     return [(solid, density or DENSITIES.get(category, OTHER_DENSITY))]
 
 
 def weighed(bodies: list[Body], mass: float) -> list[Body]:
-    """The bodies with their densities scaled to a total mass in kg.
+    """Scales the densities of bodies so that they have a given total mass in kg.
 
     Raises:
-        UserError: no tool of this volume has this mass.
+        UserError: the mean density would be out of range.
     """
     volume = 1e-9 * sum(solid.volume() for solid, _ in bodies)
     low, high = DENSITY_RANGE
     if not low * volume <= mass <= high * volume:
         raise UserError(
-            f"a tool of {1e6 * volume:.3g} cm^3 does not weigh {1e3 * mass:g} g, but "
+            f"a tool of {1e6 * volume:.3g} cm^3 cannot weigh {1e3 * mass:g} g, only "
             f"{1e3 * low * volume:.1g} to {1e3 * high * volume:.2g} g: check --mass_g and the "
             "length"
         )
@@ -79,7 +80,7 @@ def weighed(bodies: list[Body], mass: float) -> list[Body]:
 
 
 def _border(solid: Manifold, category: str) -> float | None:
-    """The x at which the head or the blade begins; None if the widths do not show it."""
+    """Returns the x at which the head or the blade begins; None if the widths do not show it."""
     x, widths = _widths(solid)
     ends = max(1, round(_END * len(x)))
     if category == "hammer":
@@ -95,7 +96,7 @@ def _border(solid: Manifold, category: str) -> float | None:
 
 
 def _widths(solid: Manifold) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Positions along x, and the solid's width along y at each."""
+    """Returns positions (n) along x, and the solid's width (n) along y at each of them."""
     vertices, _ = meshes.vertices_and_faces(solid.refine_to_length(2.0))
     low, high = vertices[:, 0].min(), vertices[:, 0].max()
     edges = np.linspace(low, high, _SLICES + 1)

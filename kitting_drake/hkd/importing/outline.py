@@ -1,4 +1,4 @@
-"""Reads outlines of tools from SVG or DXF in true millimetres, and extrudes them to solids."""
+"""Reads outlines of tools from SVG or DXF, in mm, and extrudes them to solids."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -25,9 +25,9 @@ class Drawing:
     """The outline of a tool, as drawn."""
 
     outline: CrossSection
-    """In mm."""
+    """The outline in mm."""
     measured: str
-    """How lengths were measured, a phrase for the user."""
+    """A phrase for the user that says how lengths were measured."""
     notes: list[str]
     """Phrases for the user on curves that were left out or closed."""
 
@@ -38,15 +38,15 @@ def is_outline(path: Path) -> bool:
 
 
 def read_drawing(path: Path, unit_mm: float | None = None) -> Drawing:
-    """The area inside a drawing's largest closed curve and outside its other curves.
+    """Reads the outline in a drawing: the area inside its largest closed curve, less its holes.
 
-    A page or frame around them is left out, and what is drawn twice counts once. Lines, arcs and
-    open polylines are joined where their ends meet.
+    A page or frame around the outline is left out, and curves that are drawn twice count once.
+    Lines, arcs and open polylines are joined where their ends meet.
 
     Args:
         path: the path of the drawing.
-        unit_mm: the length of a unit of the drawing; None follows the file: see `svg_curves` and
-            `dxf_curves`.
+        unit_mm: the length in mm of a unit of the drawing; None takes the unit from the file (see
+            `svg_curves` and `dxf_curves`).
 
     Raises:
         UserError: the file is missing or not a drawing, its size is unknown, a curve is open, or
@@ -99,7 +99,8 @@ def laid_along_x(
 
 
 def extruded(outline: CrossSection, height_mm: float) -> tuple[NDArray, NDArray]:
-    """Vertices (n, 3), in mm, and triangles (m, 3) of the upright prism over an outline."""
+    """Returns the vertices (n, 3) in mm and triangles (m, 3) of the upright prism over an
+    outline."""
     mesh = Manifold.extrude(outline, height_mm).to_mesh64()
     vertices = np.asarray(mesh.vert_properties, dtype=float)[:, :3]
     return vertices, np.asarray(mesh.tri_verts, dtype=np.int64)

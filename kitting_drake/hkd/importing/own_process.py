@@ -1,4 +1,4 @@
-"""Runs an import in a process of its own, which may crash or take too long."""
+"""Runs an import in a child process, because it may crash or take too long."""
 
 import math
 import multiprocessing
@@ -13,17 +13,18 @@ from kitting_drake.hkd.importing.import_request import ImportRequest
 from kitting_drake.hkd.importing.prepare import Prepared, prepare_tool
 
 TIME_LIMIT = 55.0
-"""Seconds of processor time after which the import is aborted."""
+"""The processor time in seconds after which an import is aborted."""
 MOST_WAITING = 20.0
-"""The longest wait for one step, in wall-clock time as a multiple of the time limit.
+"""The longest wait for one step, in wall-clock time, as a multiple of the limit of processor time.
 
-It only ends a process that hangs: the processor time is limited, and the machine may be busy.
+It is long, because it only has to end a process that hangs, and the machine may be busy.
 """
 _MOST_MEMORY = 12 * 2**30
 
 
 def prepare_aside(request: ImportRequest, name: str, made: Path, time_limit: float) -> Prepared:
-    """Runs `prepare_tool` in a process that is killed after `time_limit` of processor time."""
+    """Runs `prepare_tool` in a child process, which is killed after `time_limit` seconds of
+    processor time."""
     step = "starting"
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe(duplex=False)
@@ -47,7 +48,8 @@ def prepare_aside(request: ImportRequest, name: str, made: Path, time_limit: flo
                 f"it while {step}: decimate the mesh first"
             ) from end
         raise UserError(
-            f"{request.mesh} cannot be processed, by a crash while {step}: repair the mesh first"
+            f"{request.mesh} cannot be processed: the import crashed while {step}; repair the "
+            "mesh first"
         ) from end
     finally:
         process.kill()
@@ -62,7 +64,7 @@ def _child(
     pipe: Connection, request: ImportRequest, name: str, made: Path, time_limit: float
 ) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    # Discard what libraries print; results go through the pipe.
+    # Discard the output of libraries; the result goes through the pipe.
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 1)
     os.dup2(nowhere, 2)

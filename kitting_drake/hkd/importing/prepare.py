@@ -1,4 +1,4 @@
-"""Makes the files of a tool: the steps of `hkd import`, in order."""
+"""Makes the files of a tool: runs the steps of `hkd import` in order."""
 
 import hashlib
 import math
@@ -30,15 +30,15 @@ from kitting_drake.hkd.tools.sdf import tool_sdf
 from kitting_drake.hkd.tools.symmetry import symmetry_order
 from kitting_drake.hkd.tools.tool import Tool, load_tool
 
-# A tool that comes to rest tilted by more than `_SAME_POSE_DEG` is moved to that pose and dropped
-# again, at most `_LAYINGS` times.
+# If a dropped tool comes to rest tilted by more than `_SAME_POSE_DEG`, it is moved to that pose and
+# dropped again, at most `_LAYINGS` times.
 _SAME_POSE_DEG, _LAYINGS = 2.0, 3
-# A tool that tips over when the table tilts by this, in degrees, is not stable.
+# A stable tool stays upright when the table is tilted by this angle, in degrees.
 _TIPS_DEG = 10.0
-# The hydroelastic modulus, in Pa. The catalogue's would let the pads sink so far into a thin blade
-# that they seem to hold nothing, and up a round handle's slope.
+# The hydroelastic modulus, in Pa. With the catalogue's, the pads would sink too far into thin
+# blades and slide up round handles.
 _MODULUS = 8e6
-# A larger deviation of the collision hulls from the outline is reported.
+# The deviation of the collision hulls from the outline above which the user is told, in mm.
 _TRUE_OUTLINE_MM = 0.35
 Prepared = tuple[dict[str, Any], list[str], int]
 Say = Callable[[str], None]
@@ -51,7 +51,7 @@ def _silent(step: str) -> None:
 
 
 def digest_of(path: Path) -> str:
-    """The SHA-256 of a file's content."""
+    """Returns the SHA-256 of a file's content."""
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
@@ -61,13 +61,13 @@ def prepare_tool(
     """Writes a tool's files into an empty folder.
 
     Args:
-        request: what to make it of.
+        request: the file to import, and the properties of the tool.
         name: the tool's name.
         directory: the folder.
-        say: called with the name of each step.
+        say: a function that is called with the name of each step.
 
     Returns:
-        Its record, the assumptions and repairs, and the number of collision hulls.
+        The tool's record, notes on assumptions and repairs, and the number of collision hulls.
 
     Raises:
         UserError: the tool cannot be made.
@@ -83,7 +83,8 @@ def prepare_tool(
     except OSError as error:
         raise UserError(f"cannot write {name}: {error.strerror}") from error
     except Exception as error:
-        # Geometry libraries fail in many ways on broken meshes, which are the user's to repair.
+        # Geometry libraries raise many types of errors on broken meshes, which the user has to
+        # repair.
         raise UserError(
             f"{request.mesh} cannot be processed ({type(error).__name__}): repair the mesh first"
         ) from error
@@ -101,7 +102,7 @@ def _prepare(request: ImportRequest, name: str, directory: Path, say: Say) -> Pr
     solid, notes = make_solid((vertices - (low + high) / 2) * nominal, faces)
     drawn = is_outline(request.mesh)
     say("laying it down")
-    # An outline shows the tool at rest, from above.
+    # An outline already shows the tool at rest, from above.
     solid = (facing_forward if drawn else to_tool_frame)(solid, request.category)
     length = size(solid)[0] / nominal
     if drawn:
@@ -132,16 +133,18 @@ def _prepare(request: ImportRequest, name: str, directory: Path, say: Say) -> Pr
         solid = fitted.transform(np.column_stack([tilt, np.zeros(3)]))
         length = request.length_mm or size(solid)[0]
         laid = [f"laid in its resting pose, which is tilted by {angle:.0f} degrees"]
-    # No pose is at rest: use the one with the lowest centre of mass.
+    # The tool keeps no pose, so use the one with the lowest centre of mass.
     _empty(directory)
     notes.append("it rolls on a table")
     return _write(request, name, directory, first, wanted, notes, say)[0]
 
 
 def _surface(request: ImportRequest) -> tuple[np.ndarray, np.ndarray, list[str]]:
-    """Vertices (n, 3) and triangles (m, 3): of a mesh in its units, or of an outline in mm.
+    """Returns the surface that a request describes.
 
-    Also notes; for an outline, the first says how it was measured.
+    Returns:
+        Vertices (n, 3), triangles (m, 3) and notes. The vertices of a mesh are in its own units,
+        those of an outline in mm. The first note on an outline says how it was measured.
     """
     if not is_outline(request.mesh):
         return *read_mesh(request.mesh), []
@@ -150,7 +153,7 @@ def _surface(request: ImportRequest) -> tuple[np.ndarray, np.ndarray, list[str]]
     try:
         drawing = read_drawing(request.mesh, unit_mm)
     except UserError:
-        # An unknown unit does not matter to what is scaled.
+        # The unit does not matter for a drawing that is scaled to a given length.
         if request.length_mm is None or unit_mm is not None:
             raise
         drawing = read_drawing(request.mesh, 1.0)
@@ -175,7 +178,7 @@ def _write(
     notes: list[str],
     say: Say,
 ) -> tuple[Prepared, Manifold]:
-    """Writes the files of a solid (mm) in the tool frame; also returns the solid as scaled."""
+    """Writes the files of a solid (in mm, in the tool frame); also returns the scaled solid."""
     notes = list(notes)
     category, density = request.category, request.given_density
     say("finding a grasp")
@@ -185,9 +188,13 @@ def _write(
         bodies = weighed(bodies, 1e-3 * request.mass_g)
     mass, center, inertia = mass_properties(bodies)
     if len(bodies) > 1:
-        notes.append(f"{_FRONTS[category]} taken to be steel, its handle light")
+        notes.append(
+            f"{_FRONTS[category]} is assumed to be of steel, its handle of a light material"
+        )
     if request.mass_g is None and density is None:
-        notes.append("its mass is a guess: give --mass_g, or --material if it is of one")
+        notes.append(
+            "its mass is a guess: give --mass_g, or --material if the tool is of one material"
+        )
     vertices, faces = meshes.vertices_and_faces(solid)
     say("making its collision hulls")
     collision = decompose(solid, tool.grasp)
@@ -234,7 +241,7 @@ def _write(
 def _properties(
     tool: Tool, mass: float, center: NDArray[np.float64], symmetry: int
 ) -> dict[str, Any]:
-    """A tool's record without its origin."""
+    """Returns a tool's record, without the part on the file that it comes from."""
     return {
         "name": tool.name,
         "category": tool.category,
@@ -252,5 +259,5 @@ def _properties(
 
 
 def _safe(text: str) -> str:
-    """Text that is safe in an XML comment."""
+    """Returns text in which no characters can end an XML comment."""
     return re.sub(r"[^\w. ]|-", "_", text, flags=re.ASCII)

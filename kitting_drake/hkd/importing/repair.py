@@ -1,9 +1,9 @@
-"""Makes any mesh one solid, the first step of `hkd import`.
+"""Turns any mesh into one solid, the first step of `hkd import`.
 
-A watertight mesh is used as it is. Any other is split into connected components. Each is repaired
-alone (winding, then small holes, then flat openings, then pymeshfix), and all are united, minus
-sealed hollows. If that loses visible parts, the surface is wrapped instead: filled as voxels and
-traced.
+A watertight mesh is used as it is. Any other mesh is split into connected components. Each
+component is repaired alone: its winding, then small holes, then flat openings, and the rest by
+pymeshfix. The components are then united, and sealed hollows are subtracted. If visible parts are
+lost, the surface is filled as voxels, and the surface of the voxels is traced.
 """
 
 import numpy as np
@@ -17,26 +17,27 @@ from scipy.spatial import cKDTree
 from kitting_drake.common.errors import UserError
 from kitting_drake.hkd.importing.closing import capped
 
-# Solids are repaired at this size in any unit; the tolerances below are for it.
+# Meshes are scaled to this length for repair. The tolerances below refer to it.
 NOMINAL_MM = 180.0
 
 # Vertices in the same cell of this grid are merged.
 _MERGE_MM = 1e-3
-# Bodies further apart than this are separate objects. An object with less than this share of the
-# volume is dirt.
+# Bodies that are farther apart than this are separate objects. An object with less than the share
+# `_DIRT` of the volume is removed.
 _GAP_MM, _DIRT = 1.5, 0.02
-# The share of any of its three projections that a repaired mesh may lose.
+# The largest share of the area of a projection along x, y or z that a repair may lose.
 _LOST = 0.03
 # The size of a pixel of the compared projections.
 _PIXEL_MM = 0.5
-# If repair adds more than this share of surface, it is reported. The repaired surface is sampled at
-# `_PROBES` points; one that is further than `_AWAY_MM` from the given surface counts as added.
+# If repair adds more than the share `_TELLING` of the surface, the user is told. The repaired
+# surface is sampled at `_PROBES` points; a point counts as added if it is farther than `_AWAY_MM`
+# from the given surface.
 _TELLING, _AWAY_MM, _PROBES = 0.03, 1.5, 20_000
 _MOST_COMPONENTS = 3000
 _VOXEL_MM = 0.75
 # The largest share of a hollow's volume outside its body.
 _OUTSIDE = 0.01
-# A mesh that fills less than this share of its bounding box encloses no volume.
+# A mesh that fills a smaller share of its bounding box counts as one without volume.
 _HOLLOW = 0.002
 
 Array = NDArray[np.float64]
@@ -44,10 +45,13 @@ Faces = NDArray[np.int64]
 
 
 def make_solid(vertices: Array, faces: Faces) -> tuple[Manifold, list[str]]:
-    """The solid of a mesh whose longest side is `NOMINAL_MM`, and notes on its repairs.
+    """Makes the solid of a mesh whose longest side is `NOMINAL_MM`.
+
+    Returns:
+        The solid, and notes for the user on its repairs.
 
     Raises:
-        UserError: the mesh encloses no volume, or consists of several things.
+        UserError: the mesh encloses no volume, or consists of several objects.
     """
     vertices, faces = _merged(vertices, faces)
     if len(faces) < 4:
@@ -84,7 +88,7 @@ def make_solid(vertices: Array, faces: Faces) -> tuple[Manifold, list[str]]:
         added = _added(triangles, solid)
         if added > _TELLING:
             notes.append(
-                f"{100 * added:.0f} % of its surface was missing: check by `hkd sheet` that the "
+                f"{100 * added:.0f} % of its surface was missing: check with `hkd sheet` that the "
                 "file is complete"
             )
     if solid.is_empty() or solid.volume() < _HOLLOW * _box_volume(solid):
@@ -103,12 +107,15 @@ def _told_apart(
 ) -> tuple[list[Manifold], list[Manifold]]:
     """Separates bodies from the sealed hollows inside them.
 
-    A hollow's surface is wound opposite to that of the body around it. A surface that is not inside
-    another bounds a body, whatever its winding.
+    The surface of a hollow is wound in the opposite direction to that of the body around it. A
+    surface that is not inside another one bounds a body, whatever its winding.
 
     Args:
         outward: the solids inside surfaces with outward normals.
         inward: the solids inside surfaces with inward normals.
+
+    Returns:
+        The bodies and the hollows.
     """
     if inward and max((s.volume() for s in outward), default=0.0) < max(s.volume() for s in inward):
         outward, inward = inward, outward
@@ -120,7 +127,7 @@ def _told_apart(
 
 
 def _volume(triangles: Array) -> float:
-    """The signed volume inside triangles (n, 3, 3): negative for inward normals."""
+    """Returns the signed volume inside triangles (n, 3, 3); it is negative for inward normals."""
     a, b, c = np.moveaxis(triangles - triangles.mean(axis=(0, 1)), 1, 0)
     return float((a * np.cross(b, c)).sum() / 6)
 
@@ -136,7 +143,7 @@ def _merged(vertices: Array, faces: Faces) -> tuple[Array, Faces]:
 
 
 def _as_manifold(vertices: Array, faces: Faces) -> Manifold | None:
-    """The solid inside a surface, or None if the surface does not bound one."""
+    """Returns the solid inside a surface, or None if the surface does not bound one."""
     if len(faces) < 4 or not _is_closed(faces):
         return None
     used, index = np.unique(faces, return_inverse=True)
@@ -150,7 +157,7 @@ def _as_manifold(vertices: Array, faces: Faces) -> Manifold | None:
 
 
 def _is_closed(faces: Faces) -> bool:
-    """Whether each edge occurs once in each direction; otherwise manifold3d may crash."""
+    """Whether each edge occurs once in each direction. Otherwise manifold3d may crash."""
     edges = np.vstack([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     keys = edges[:, 0] * (faces.max() + 1) + edges[:, 1]
     opposite = edges[:, 1] * (faces.max() + 1) + edges[:, 0]
@@ -182,7 +189,8 @@ def _repaired(vertices: Array, faces: Faces) -> Manifold | None:
         fixer.fill_small_boundaries(0, False)
         solid = _fixed(fixer)
         if solid is None:
-            # Slow; it also removes surfaces that cross each other, which does no harm here.
+            # This step is slow. It also removes surfaces that cross each other, which does no harm
+            # here.
             fixer.clean(10, 3)
             solid = _fixed(fixer)
     except RuntimeError:
@@ -196,7 +204,8 @@ def _fixed(fixer: pymeshfix.PyTMesh) -> Manifold | None:
 
 
 def _loses(triangles: Array, solid: Manifold) -> bool:
-    """Whether a solid lacks visible parts of the triangles in any of three projections."""
+    """Whether visible parts of triangles (n, 3, 3) are missing from a solid in any of three
+    projections."""
     if solid.is_empty():
         return True
     mesh = solid.to_mesh64()
@@ -212,17 +221,17 @@ def _loses(triangles: Array, solid: Manifold) -> bool:
         seen, kept = (np.zeros(shape[axes], dtype=bool) for _ in range(2))
         seen[tuple(pixels[:, axes].T)] = True
         kept[tuple(my_pixels[:, axes].T)] = True
-        # Tolerate one pixel at the rim, which sampling may miss.
+        # Tolerate one pixel at the rim, because sampling may miss the rim.
         lost = (seen & ~ndimage.binary_dilation(kept, around)).sum()
         gained = (kept & ~ndimage.binary_dilation(seen, around)).sum()
-        # Filled holes gain area, so only large gains count.
+        # A repair that fills holes adds area, so ignore small additions.
         if lost > _LOST * seen.sum() or gained > 5 * _LOST * seen.sum():
             return True
     return False
 
 
 def _added(triangles: Array, solid: Manifold) -> float:
-    """The share of a solid's surface that is far from all triangles."""
+    """Returns the share of a solid's surface that is far from all triangles (n, 3, 3)."""
     if solid.is_empty():
         return 0.0
     mesh = solid.to_mesh64()
@@ -238,7 +247,8 @@ def _added(triangles: Array, solid: Manifold) -> float:
 
 
 def _sampled(triangles: Array, step: float) -> Array:
-    """Points (n, 3) of a surface, dense enough to hit almost every square of side `step`."""
+    """Returns points (n, 3) of a surface, dense enough to hit almost every square of side
+    `step`."""
     corners = triangles.reshape(-1, 3)
     mesh = trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), process=False)
     count = int(min(4e6, 12 * mesh.area / step**2)) + 1
@@ -247,7 +257,8 @@ def _sampled(triangles: Array, step: float) -> Array:
 
 
 def _wrapped(triangles: Array) -> Manifold:
-    """The solid inside a surface with gaps of a few voxels, accurate to about half a voxel."""
+    """Returns the solid inside a surface with gaps of a few voxels, accurate to about half a
+    voxel."""
     corners = triangles.reshape(-1, 3)
     margin = 5 * _VOXEL_MM
     low = corners.min(axis=0) - margin
@@ -266,14 +277,14 @@ def _wrapped(triangles: Array) -> Manifold:
     field = ndimage.gaussian_filter(distance, 0.7) - 0.5
     inside = np.argwhere(field > -3)
     first, last = inside.min(axis=0), inside.max(axis=0)
-    # Single numbers are faster to read from a memoryview than from an array.
+    # Read single numbers from a memoryview, which is faster than from an array.
     values = np.ascontiguousarray(field).reshape(-1).data
     last_x, last_y, last_z = (int(extent) - 2 for extent in shape)
     low_x, low_y, low_z = map(float, low)
     row, plane = int(shape[2]), int(shape[1] * shape[2])
 
     def depth(x: float, y: float, z: float) -> float:
-        """The field at a point, interpolated linearly."""
+        """Returns the field at a point, interpolated linearly."""
         i, j, k = (x - low_x) / _VOXEL_MM, (y - low_y) / _VOXEL_MM, (z - low_z) / _VOXEL_MM
         a, b, c = (
             min(max(int(i), 0), last_x),
@@ -300,10 +311,10 @@ def _box_volume(solid: Manifold) -> float:
 
 
 def _one_thing(solid: Manifold, notes: list[str]) -> Manifold:
-    """Removes the dirt around the solid.
+    """Removes small loose pieces around the largest solid.
 
     Raises:
-        UserError: it consists of several separate things.
+        UserError: the mesh consists of several separate objects.
     """
     bodies = sorted(solid.decompose(), key=lambda body: -body.volume())
     if len(bodies) <= 1:
@@ -319,8 +330,8 @@ def _one_thing(solid: Manifold, notes: list[str]) -> Manifold:
     main = int(np.argmax(volumes))
     if volumes[main] < (1 - _DIRT) * whole:
         raise UserError(
-            f"the mesh holds {len(groups)} separate things: import each from its own file"
+            f"the mesh holds {len(groups)} separate objects: import each from its own file"
         )
     if len(groups) > 1 or crumbs:
-        notes.append("removed loose dirt")
+        notes.append("removed small loose pieces")
     return Manifold.batch_boolean(groups[main], OpType.Add)

@@ -1,7 +1,7 @@
-"""The pose in which an imported tool comes to rest in simulation.
+"""Simulates in which pose an imported tool comes to rest.
 
-Geometry alone finds stable poses that a tool does not keep: a screwdriver balanced on its handle
-tips at a touch. So the tool is dropped from a small height onto a table.
+Geometry alone accepts poses that a real tool does not keep: a screwdriver that balances on its
+handle tips over at a touch. Therefore the tool is dropped onto a table from a small height.
 """
 
 from pathlib import Path
@@ -27,20 +27,21 @@ from pydrake.systems.framework import DiagramBuilder
 from kitting_drake.common.sdformat import model_text
 
 _DROP = 0.002
-"""The height of the drop, in metres."""
+"""The height from which the tool is dropped, in metres."""
 _SETTLE = 2.0
 """The simulated time, in seconds."""
 _STEP, _SMALL_STEP = 1 / 128, 1 / 1024
 _SMALL_MM = 60.0
-"""Shorter tools are so light that the long step tilts them."""
+"""The length in mm below which a shorter time step is needed, because the tool is so light that the
+usual step tilts it."""
 _FRICTION = 0.5
 
 
 def resting_tilt(sdf: Path, length_mm: float = 180.0) -> NDArray[np.float64]:
-    """R (3, 3): the tilt of a dropped tool at rest, without the rotation about z.
+    """Drops a tool onto a table; returns its tilt R (3, 3) at rest, without the rotation about z.
 
     Args:
-        sdf: SDFormat of the tool, of one link whose frame has the table at z = 0.
+        sdf: an SDFormat file with one link, in whose frame the table is at z = 0.
         length_mm: the tool's length.
     """
     builder = DiagramBuilder()

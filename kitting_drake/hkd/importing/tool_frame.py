@@ -1,4 +1,4 @@
-"""Moves a solid into the tool frame: in a stable pose, along x, working end toward +x."""
+"""Moves a solid into the tool frame: in a stable pose, along x, with its working end toward +x."""
 
 import numpy as np
 import trimesh
@@ -12,23 +12,24 @@ from kitting_drake.hkd.tools.stable_pose import StablePose, stable_poses
 
 Array = NDArray[np.float64]
 
-# For a solid about 180 mm long. Stable poses count as equally low if their centre of mass is less
-# than the first number higher than in the lowest pose. Of these, the pose with the broadest support
-# is chosen; supports are compared in steps of the second number.
+# For a solid about 180 mm long. Stable poses count as equally low if their centres of mass are
+# within the first number of the lowest one. Of these, the pose with the broadest support is chosen.
+# Supports are compared after rounding to multiples of the second number.
 _EQUAL_HEIGHT_MM, _MARGIN_STEP_MM = 0.3, 0.5
-# The largest angle between the direction of the length and the axis of least inertia; and the
-# standard deviation of the votes. Each edge votes for all directions, with a weight that is a
-# Gaussian of the angle between edge and direction.
+# A tool's direction is found by votes of its edges: each edge votes for the directions near its
+# own, with a Gaussian weight. First the largest angle between the result and the axis of least
+# inertia, then the standard deviation of the Gaussian.
 _SIDEWAYS_DEG, _LIKE_DEG = 25.0, 6.0
 _END = 0.3
-"""The share of the length that counts as an end."""
+"""The length of an end, as a share of the tool's length."""
 
 
 def to_tool_frame(solid: Manifold, category: str) -> Manifold:
-    """Moves a solid (mm) into the frame T of a tool of that category; see `Tool`.
+    """Moves a solid (in mm) into the frame T of a tool of the given category; see `Tool`.
 
-    The pose is the stable one with the lowest centre of mass. The working end is the wider end of a
-    hammer, the end nearer the centre of mass of a wrench, and the narrower end of any other tool.
+    The pose is the stable pose with the lowest centre of mass. The working end is the wider end of
+    a hammer, the end nearer to the centre of mass of a wrench, and the narrower end of any other
+    tool.
 
     Raises:
         UserError: the solid is flat or has no stable pose.
@@ -42,16 +43,17 @@ def to_tool_frame(solid: Manifold, category: str) -> Manifold:
 
 
 def facing_forward(solid: Manifold, category: str) -> Manifold:
-    """Moves a solid (mm) at rest along x into the frame T, with its working end at +x.
+    """Moves a solid (in mm) that rests along x into the frame T, with its working end toward +x.
 
-    See `to_tool_frame` for the working end."""
+    `to_tool_frame` says which end is the working end.
+    """
     if not _works_at_plus_x(solid, category):
         solid = solid.rotate((0.0, 0.0, 180.0))
     return centred(solid)
 
 
 def tipping_deg(solid: Manifold) -> float:
-    """The tilt of the table, in degrees, at which a solid (mm) at rest tips over.
+    """Returns the tilt of the table, in degrees, at which a solid (in mm) at rest tips over.
 
     It is 0 if the solid is not in a stable pose.
     """
@@ -62,20 +64,21 @@ def tipping_deg(solid: Manifold) -> float:
 
 
 def centred(solid: Manifold) -> Manifold:
-    """The solid moved to T's origin: centred in its bounding box, and on the table."""
+    """Moves a solid to T's origin: centred in its bounding box, and on the table."""
     low, high = np.array(solid.bounding_box()).reshape(2, 3)
     middle = (low + high) / 2
     return solid.translate((-middle[0], -middle[1], -low[2]))
 
 
 def size(solid: Manifold) -> Array:
-    """The extents (3,) of the bounding box."""
+    """Returns the extents (3,) of a solid's bounding box."""
     low, high = np.array(solid.bounding_box()).reshape(2, 3)
     return high - low
 
 
 def _lowest_pose(vertices: Array, com: Array) -> StablePose:
-    """The stable pose with the lowest centre of mass; of equally low ones, the broadest support.
+    """Returns the stable pose with the lowest centre of mass; of equally low ones, that with the
+    broadest support.
 
     Raises:
         UserError: there is no stable pose.
@@ -88,7 +91,7 @@ def _lowest_pose(vertices: Array, com: Array) -> StablePose:
         raise UserError("the mesh has no stable pose")
     lowest = min(pose.height for pose in poses)
     good = [pose for pose in poses if pose.height < lowest + _EQUAL_HEIGHT_MM]
-    # Of poses that are still equal, take the nearest to the pose in the file.
+    # If poses are still equal, choose the one nearest to the pose in the file.
     return max(
         good,
         key=lambda pose: (round(pose.margin / _MARGIN_STEP_MM), -round(float(pose.normal[2]), 3)),
@@ -96,12 +99,14 @@ def _lowest_pose(vertices: Array, com: Array) -> StablePose:
 
 
 def long_direction_deg(outline: CrossSection) -> float:
-    """The direction of an outline's length: that of most of its edges, near its principal axis.
+    """Returns the direction of an outline's length: that of most of its edges, near its principal
+    axis.
 
-    The long edges of a handle therefore outvote a head or a jaw that sticks out to one side.
+    The long edges of a handle therefore count more than a head or a jaw that sticks out to one
+    side.
 
     Args:
-        outline: about 180 mm long.
+        outline: an outline about 180 mm long.
 
     Returns:
         The angle from x, counter-clockwise, in degrees.
@@ -117,7 +122,8 @@ def long_direction_deg(outline: CrossSection) -> float:
     directions = axis + np.arange(-_SIDEWAYS_DEG, _SIDEWAYS_DEG, 0.25)
     apart = (directions[:, None] - angles + 90.0) % 180.0 - 90.0
     votes = np.exp(-0.5 * (apart / _LIKE_DEG) ** 2) @ lengths
-    # Average the edges that agree with the winner, which is finer than the steps.
+    # Average the directions of the edges that agree with the winner, which is finer than the
+    # search's steps.
     near = apart[int(np.argmax(votes))]
     weights = lengths * np.exp(-0.5 * (near / _LIKE_DEG) ** 2)
     return float(directions[int(np.argmax(votes))] - np.average(near, weights=weights))
@@ -136,7 +142,7 @@ def _works_at_plus_x(solid: Manifold, category: str) -> bool:
 
 
 def _width(outline: CrossSection, start: float, end: float) -> float:
-    """The mean width of the hull of an outline between two positions along x."""
+    """Returns the mean width of the hull of an outline between two positions along x."""
     y_min, y_max = outline.bounds()[1], outline.bounds()[3]
     band = CrossSection.square((end - start, y_max - y_min)).translate((start, y_min))
     return float((outline ^ band).hull().area() / (end - start))

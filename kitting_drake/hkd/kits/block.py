@@ -1,4 +1,4 @@
-"""The kit block: its solid, and its surface meshed for the contact solver."""
+"""The kit block as a solid, and its surface as meshes for the contact solver."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,14 +12,18 @@ from kitting_drake.hkd.kits.parameters import KitParameters
 ARC_SEGMENTS = 64
 """The number of edges of a full circle in a rounded outline."""
 _CELL = 0.02
-"""The largest piece of a wall or the top for the contact solver, in metres."""
+"""The largest size of the pieces into which walls and top are cut for the contact solver, in
+metres."""
 
 Triangles = tuple[NDArray[np.float64], NDArray[np.int64]]
 """Vertices (n, 3), in metres, and faces (m, 3)."""
 
 
 class _Surface:
-    """Collects triangles ring by ring; lengths in metres, normals out of the cavity."""
+    """Collects the triangles of a surface, ring by ring.
+
+    Lengths are in metres. The triangles' normals point away from the cavity.
+    """
 
     def __init__(self) -> None:
         self._vertices: list[NDArray[np.float64]] = []
@@ -27,17 +31,18 @@ class _Surface:
         self._count = 0
 
     def add_vertices(self, vertices: NDArray[np.float64]) -> int:
-        """Adds (n, 3) vertices; returns the index of the first."""
+        """Adds vertices (n, 3); returns the index of the first."""
         self._vertices.append(vertices)
         self._count += len(vertices)
         return self._count - len(vertices)
 
     def add_faces(self, faces: NDArray[np.int64]) -> None:
-        """Adds (n, 3) faces."""
+        """Adds triangles (n, 3), each three indices of vertices."""
         self._faces.append(faces)
 
     def add_ring(self, loops: list[NDArray[np.float64]], z: float) -> int:
-        """Adds the vertices of closed loops at height z; returns the index of the first."""
+        """Adds the vertices of closed loops, each (n, 2), at height z; returns the index of the
+        first."""
         flat = np.concatenate(loops)
         return self.add_vertices(np.column_stack([flat, np.full(len(flat), z)]))
 
@@ -58,7 +63,7 @@ class _Surface:
         inner_loops: list[NDArray[np.float64]],
         inner: int,
     ) -> None:
-        """Joins a ring to a narrower, lower one by the triangulated band between their loops."""
+        """Joins a ring to a narrower, lower one by triangulating the band between their loops."""
         band = np.asarray(triangulate(outer_loops + [loop[::-1] for loop in inner_loops]))
         starts = np.cumsum([0, *map(len, inner_loops[:-1])])
         inner_index = [
@@ -69,7 +74,7 @@ class _Surface:
         self.add_faces(np.concatenate([outer_index, *inner_index])[band][:, ::-1])
 
     def arrays(self) -> Triangles:
-        """The vertices and faces added so far."""
+        """Returns the vertices and faces added so far."""
         return np.concatenate(self._vertices), np.concatenate(self._faces)
 
 
@@ -88,17 +93,20 @@ class Cavity:
 
     @property
     def rim(self) -> CrossSection:
-        """The outline at the top, outside the bevel."""
+        """The outline at the block's top, where the bevel begins."""
         if self.lead_in <= 0:
             return self.outline
         return self.outline.offset(self.lead_in, JoinType.Round, circular_segments=ARC_SEGMENTS)
 
     def add_sides(self, surface: _Surface, longest: float = np.inf) -> tuple[int, int]:
-        """Adds walls and bevel; returns the first vertices of the floor's and the rim's rings.
+        """Adds the cavity's walls and its bevel to a surface.
 
         Args:
             surface: the surface to add to.
             longest: the largest length of an outline's edge, in metres.
+
+        Returns:
+            The indices of the first vertex of the floor's ring and of the rim's ring.
         """
         wall_loops = _subdivided(self.outline.to_polygons(), longest)
         rim_loops = _subdivided(self.rim.to_polygons(), longest)
@@ -114,7 +122,7 @@ class Cavity:
         return floor, rim
 
     def cutter(self) -> Manifold:
-        """The solid to subtract from the block."""
+        """Returns the solid to subtract from the block."""
         surface = _Surface()
         floor, rim = self.add_sides(surface)
         rim_loops = self.rim.to_polygons()
@@ -127,7 +135,8 @@ class Cavity:
 
 
 def _subdivided(loops: list[NDArray[np.float64]], longest: float) -> list[NDArray[np.float64]]:
-    """Adds vertices to closed loops so that no edge is longer than `longest`."""
+    """Adds vertices to closed loops, each (n, 2), so that no edge is longer than `longest`
+    metres."""
     result = []
     for loop in loops:
         edges = np.roll(loop, -1, axis=0) - loop
@@ -140,7 +149,7 @@ def _subdivided(loops: list[NDArray[np.float64]], longest: float) -> list[NDArra
 
 
 def build_block(cavities: Sequence[Cavity], parameters: KitParameters) -> Manifold:
-    """The kit block in frame K, in metres: watertight and connected.
+    """Builds the kit block in the kit frame K, in metres: watertight and connected.
 
     Args:
         cavities: the cavities to cut.
@@ -154,9 +163,9 @@ def build_block(cavities: Sequence[Cavity], parameters: KitParameters) -> Manifo
 
 
 def _add_floor(surface: _Surface, cavity: Cavity, cavities: Sequence[Cavity]) -> None:
-    """Adds a cavity's floor as its bounding rectangle, minus other cavities at least as deep.
+    """Adds a cavity's floor: its bounding rectangle, minus other cavities at least as deep.
 
-    Inside those other cavities the rectangle would be a shelf or a second floor.
+    Inside those other cavities, the rectangle would be a shelf or a second floor.
     """
     x_min, y_min, x_max, y_max = cavity.outline.bounds()
     corners = np.array([(x_min, y_min), (x_max, y_min), (x_max, y_max), (x_min, y_max)])
@@ -175,16 +184,23 @@ def _add_floor(surface: _Surface, cavity: Cavity, cavities: Sequence[Cavity]) ->
 
 
 def contact_surfaces(cavities: Sequence[Cavity], parameters: KitParameters) -> dict[str, Triangles]:
-    """The block's surface meshed for the contact solver: sides, floors, top and outside.
+    """Meshes the block's surface for the contact solver: sides, floors, top and outside.
 
-    The geometry is that of the block, apart from the missing underside. The solver's cost grows
-    with the number of bounding boxes, each of a few neighbouring triangles, that an object
-    overlaps. A plain triangulation has long slivers with overlapping boxes, which also split
-    contact patches into many polygons. So:
+    The geometry is that of the block without its underside. The solver puts small groups of
+    neighbouring triangles into bounding boxes; its cost grows with the number of boxes that an
+    object overlaps. A plain triangulation has long slivers. Their boxes overlap, and they split
+    contact patches into many polygons. Therefore:
 
     - each floor is one rectangle that extends into the solid, where nothing can touch it;
     - top and walls are cut into small pieces;
     - large and small triangles are in separate meshes, because they would share large boxes.
+
+    Args:
+        cavities: the block's cavities.
+        parameters: the parameters of the kit.
+
+    Returns:
+        The meshes by name, in the kit frame K.
     """
     sides, floors, top, outside = _Surface(), _Surface(), _Surface(), _Surface()
     room = CrossSection.square((parameters.length, parameters.width), True)
@@ -204,7 +220,7 @@ def contact_surfaces(cavities: Sequence[Cavity], parameters: KitParameters) -> d
     outside.add_walls(
         loops, outside.add_ring(loops, 0.0), outside.add_ring(loops, parameters.height)
     )
-    # The surfaces point out of the cavities; flip them to point out of the block.
+    # The collected normals point away from the cavities; flip them to point out of the block.
     return {
         "sides": _reversed(sides),
         "floors": _reversed(floors),

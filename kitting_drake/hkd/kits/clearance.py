@@ -27,15 +27,16 @@ def measure_clearance(
 ) -> Clearance:
     """Measures the clearance along the whole outline of a seated tool.
 
-    The wall is a slice of the block halfway between floor and bevel; the outline is that of the
-    tool's visual mesh. The clearance of each point of the outline is its distance from the nearest
-    wall. This includes points in notches of the tool, which the cavity bridges.
+    The outline is that of the tool's visual mesh. The wall is a horizontal slice of the block,
+    halfway between floor and bevel. The clearance of a point of the outline is its distance from
+    the nearest wall. Points in narrow notches of the tool count; there the cavity's wall bridges
+    the notch.
 
     Args:
-        block: the kit's block, in frame K.
+        block: the kit's block, in the kit frame K.
         tool: the tool to seat.
         parameters: the parameters of the kit.
-        pose: the pose of the seated tool; by default the slot of its category.
+        pose: the pose of the seated tool in K; by default the slot of its category.
 
     Raises:
         ValueError: the seated tool is not inside a cavity.
@@ -59,7 +60,7 @@ def _points_along(loop: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _distances(points: NDArray[np.float64], shape: CrossSection) -> NDArray[np.float64]:
-    """The distance (n) of points (n, 2) to the nearest edge of a shape."""
+    """Returns the distance (n) of points (n, 2) from the nearest edge of a shape."""
     nearest = np.full(len(points), np.inf)
     for loop in shape.to_polygons():
         for start, end in zip(loop, np.roll(loop, -1, axis=0), strict=True):

@@ -1,9 +1,10 @@
-"""Kits: a block with a conformal cavity for each tool (section IV-B.2 of the paper).
+"""Kits: blocks with a conformal cavity for each tool (section IV-B.2 of the paper).
 
-The paper takes a depth image of the tool from above, fills it downward, closes it morphologically,
-grows it by 2 mm and subtracts it from the block. It then cuts the cavity open to the top. The
-result is a prism over the tool's outline. So this module closes and grows the exact outline by
-polygon offsetting, which needs no voxels and no smoothing.
+The paper takes a depth image of the tool from above. It fills the image downward, closes it
+morphologically, grows it by 2 mm and subtracts it from the block; then it cuts the cavity open to
+the top. The result is a prism over the tool's outline. This module builds the same prism from the
+exact outline, which it closes and grows by polygon offsetting. This needs no voxels and no
+smoothing.
 """
 
 import dataclasses
@@ -27,7 +28,7 @@ from kitting_drake.hkd.tools.tool import Tool
 _DIGITS = 7
 """The number of decimals of coordinates in files."""
 _FORMAT_VERSION = "9"
-"""Part of the cache key. Change it when equal inputs give other kits."""
+"""The version of the files in the cache. Increase it when equal inputs give different kits."""
 
 
 @dataclass(frozen=True)
@@ -63,12 +64,12 @@ def make_kit(
     """Makes a kit for tools, or loads it from the cache.
 
     The cache key is the content of the tools, parameters and poses. A kit appears in the cache
-    atomically, so processes may build the same one concurrently.
+    atomically, so several processes may build the same kit at once.
 
     Args:
         tools: the tools.
         parameters: the template.
-        poses: where the tools are seated, in their order; empty: `layout_kit` chooses.
+        poses: the seated tools' poses, in the tools' order. If empty, `layout_kit` chooses them.
 
     Raises:
         UserError: the tools do not fit (see `layout_kit`), or the cache cannot be written.
@@ -95,7 +96,9 @@ def _read_layout(folder: Path, parameters: KitParameters) -> KitLayout:
             tuple(CavityPose(**pose) for pose in layout["poses"]),
         )
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UserError(f"{folder / _LAYOUT} is damaged: delete {folder}") from error
+        raise UserError(
+            f"{folder / _LAYOUT} is damaged: delete the folder {folder}, and it is made again"
+        ) from error
 
 
 def _content_key(
@@ -155,7 +158,7 @@ def _write(tools: Sequence[Tool], layout: KitLayout, directory: Path) -> None:
     cavities = kit_cavities(tools, parameters, layout.poses)
     block = build_block(cavities, parameters)
     mesh = block.to_mesh()
-    # Merge vertices that round to the same digits, which would leave cracks in the surface.
+    # Merge vertices that have equal rounded coordinates; they would leave cracks in the surface.
     rounded = np.round(np.asarray(mesh.vert_properties, dtype=float)[:, :3], _DIGITS) + 0.0
     vertices, index = np.unique(rounded, axis=0, return_inverse=True)
     faces = index[np.asarray(mesh.tri_verts, dtype=int)]
@@ -164,7 +167,7 @@ def _write(tools: Sequence[Tool], layout: KitLayout, directory: Path) -> None:
     (directory / "kit.obj").write_text(flat_obj(vertices, faces, digits=_DIGITS))
     for name, surface in contact_surfaces(cavities, parameters).items():
         (directory / f"contact_{name}.obj").write_text(flat_obj(*surface, digits=_DIGITS))
-    # Two colours, as in tool foam: faces off the block's bounding box belong to cavities.
+    # Use two colours: faces that are not on the block's bounding box belong to cavities.
     bounds = np.array(block.bounding_box()).reshape(2, 3)
     centres = vertices[faces].mean(axis=1)
     on_hull = np.isclose(centres[:, None], bounds[None], atol=1e-6).any(axis=(1, 2))

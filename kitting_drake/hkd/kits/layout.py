@@ -1,8 +1,8 @@
-"""The layout of a kit: the poses and outlines of its cavities.
+"""The layout of a kit: the size of its block, and the poses and outlines of its cavities.
 
-A toolset, with at most one tool of each of the paper's categories, takes the slots of a template.
-Other sets of tools are nested. So is a toolset with a tool that is too large for its slot, or with
-`always_nested`. The block of nested tools has the smallest size found, or a given size.
+A toolset has at most one tool of each of the paper's categories. Its tools are placed in the slots
+of a template. Tools are nested instead if they are no toolset, if one is too large for its slot, or
+if `always_nested` is set. The block of nested tools has the smallest size found, or a given size.
 """
 
 import dataclasses
@@ -60,7 +60,7 @@ class KitLayout:
 
 
 def slot_pose(tool: Tool, parameters: KitParameters) -> CavityPose:
-    """The pose of a tool in its category's slot, with its top flush with the block's.
+    """Returns the pose of a tool in its category's slot, with its top flush with the block's.
 
     Raises:
         KeyError: the tool's category has no slot.
@@ -70,12 +70,12 @@ def slot_pose(tool: Tool, parameters: KitParameters) -> CavityPose:
 
 
 def cavity_outline(outline: CrossSection, parameters: KitParameters) -> CrossSection:
-    """The outline of a tool, closed and grown by the clearance.
+    """Closes a tool's outline morphologically and grows it by the clearance.
 
     Holes are filled, because they would leave thin pillars in the cavity.
     """
     closing, clearance = parameters.closing_radius, parameters.clearance
-    # Simplify only first and last, because each time costs up to the tolerance.
+    # Simplify only at the start and the end: each time may move the outline by the tolerance.
     grown = outline.simplify(parameters.tolerance / 4).offset(
         closing + clearance, JoinType.Round, circular_segments=ARC_SEGMENTS
     )
@@ -102,9 +102,10 @@ def layout_kit(tools: Sequence[Tool], parameters: KitParameters) -> KitLayout:
     for tool in tools:
         if parameters.height - tool.height < parameters.minimum_wall - 1e-9:
             raise UserError(
-                f"'{tool.name}' is {1e3 * tool.height:.1f} mm high and leaves less than "
-                f"{1e3 * parameters.minimum_wall:.1f} mm (kit.minimum_wall) below it in a block of "
-                f"{1e3 * parameters.height:.1f} mm: use a higher block"
+                f"'{tool.name}' is {1000.0 * tool.height:.1f} mm high: in a block of "
+                f"{1000.0 * parameters.height:.1f} mm, less than "
+                f"{1000.0 * parameters.minimum_wall:.1f} mm (kit.minimum_wall) would be left "
+                "below it; use a higher block"
             )
     categories = [tool.category for tool in tools]
     unlike = len(set(categories)) == len(categories) and set(categories) <= set(SLOTS)
@@ -142,7 +143,7 @@ def _wall(parameters: KitParameters) -> float:
 
 
 def _block_sides(nesting: Nesting) -> tuple[float, float]:
-    """The sides of the smallest block that holds a nesting, in metres."""
+    """Returns the sides of the smallest block that holds a nesting, in metres."""
     length, width = (
         _SIZE_STEP * math.ceil(side / _SIZE_STEP) for side in (nesting.length, nesting.width)
     )
@@ -184,9 +185,9 @@ def _quoted(tools: Sequence[Tool]) -> str:
 
 
 def released_fingers(tool: Tool) -> CrossSection:
-    """The area under the fingers as they release a tool at its annotated grasp, in T, in metres.
+    """Returns the area under the fingers as they release a tool at its annotated grasp.
 
-    It is one rectangle for each finger, outward from the gripped face.
+    The area is one rectangle for each finger, from the gripped face outward, in T, in metres.
     """
     fingers = CrossSection()
     for side in (-1, 1):
@@ -198,7 +199,7 @@ def released_fingers(tool: Tool) -> CrossSection:
 def kit_cavities(
     tools: Sequence[Tool], parameters: KitParameters, poses: Sequence[CavityPose] | None = None
 ) -> list[Cavity]:
-    """The cavity of each tool.
+    """Returns the cavity of each tool, in the tools' order.
 
     Args:
         tools: the tools of the kit.
@@ -228,7 +229,7 @@ def moved_outline(outline: CrossSection, pose: CavityPose) -> CrossSection:
 
 
 def _has_walls(cavities: Sequence[Cavity], parameters: KitParameters) -> bool:
-    """Whether all cavities have walls between them and to the block's sides."""
+    """Whether walls of the least thickness fit between all cavities and to the block's sides."""
     half_wall = parameters.minimum_wall / 2
     grown = [
         cavity.rim.offset(half_wall, JoinType.Round, circular_segments=ARC_SEGMENTS)

@@ -1,10 +1,12 @@
 """Nesting: packs shapes of any outline on a rectangle as small as possible.
 
-Shapes are placed one by one, largest first, in strips of several widths. Each goes where it raises
-the strip's used height least, and the best strip is kept. All translations of a shape are tested at
-once on a raster: a translation is free where the cross-correlation of the shape's mask with the
-mask of the placed shapes is zero. A fast Fourier transform computes it for the whole strip. The
-masks are conservative, so the exact outlines keep their distances too.
+Shapes are placed one by one, largest first, in strips of several widths. Each shape goes where it
+raises the strip's used height least, and the best strip is kept.
+
+All translations of a shape are tested at once on a raster. A translation is free where the
+cross-correlation of the shape's mask with the mask of the placed shapes is zero; a fast Fourier
+transform computes it for the whole strip. A mask covers every cell that its shape touches, so the
+exact outlines keep their distances.
 """
 
 import itertools
@@ -23,19 +25,20 @@ PREFERRED_SIDE = 0.42
 """The longest side of a rectangle, in metres, unless the shapes need a longer one."""
 
 USUAL_SIDES = (0.48, 0.95)
-"""The largest sides, in metres, unless the shapes need more: the usual workspace of 0.5 by 1 m with
-a margin."""
+"""The largest sides, in metres, unless the shapes need more. They fit into the usual workspace of
+0.5 by 1 m with a margin."""
 
 LONGEST_SIDES = (0.90, 1.20)
-"""The largest sides of any rectangle, in metres: most of the table of 1.0 by 1.5 m."""
+"""The largest sides of any rectangle, in metres. They cover most of the table of 1.0 by 1.5 m."""
 
 _YAWS_DEG = (0, 90, 180, 270)
 _WIDTHS = (1.0, 0.9, 1.1, 0.8, 1.25, 1.45)
 """Strip widths to try, as multiples of the side of a square of the expected area."""
 _EXPECTED_USE = 0.60
-"""The expected share of the rectangle's area under outlines and their walls."""
+"""The expected ratio of the area of the outlines with their walls to the rectangle's area."""
 _ELONGATION_COST = 0.10
-"""The extra cost of a rectangle with sides of 2 to 1 over a square of the same area."""
+"""The extra cost of a rectangle with sides of 2 to 1, relative to that of a square of equal
+area."""
 _ARC_SEGMENTS = 64
 _REACH = 1.02 * CELL / math.sqrt(2)
 """The largest distance of a point from the centre of its cell, with a margin for rounding."""
@@ -49,19 +52,20 @@ class NestedShape:
     """A shape to place; lengths in metres."""
 
     outline: CrossSection
-    """Keeps its distance from all other outlines."""
+    """The shape's outline, which keeps its distance from all other outlines."""
     keep_out: CrossSection
-    """Overlaps no other shape's outline; it may overlap keep-outs."""
+    """An area that no other shape's outline may overlap; other keep-out areas may."""
 
 
 @dataclass(frozen=True)
 class NestedPose:
-    """The pose of a shape's frame in metres from the rectangle's centre, and in degrees."""
+    """The pose of a shape: its frame's origin from the rectangle's centre in metres, and its
+    angle."""
 
     x: float
     y: float
     yaw_deg: int
-    """A multiple of 90."""
+    """The rotation about z in degrees, a multiple of 90."""
 
 
 @dataclass(frozen=True)
@@ -69,9 +73,9 @@ class Nesting:
     """A rectangle and the poses of the shapes on it."""
 
     length: float
-    """Along x, in metres."""
+    """The extent along x, in metres."""
     width: float
-    """Along y."""
+    """The extent along y, in metres."""
     poses: tuple[NestedPose, ...]
     """The poses, in the shapes' order."""
 
@@ -79,12 +83,13 @@ class Nesting:
 def nest(shapes: Sequence[NestedShape], wall: float) -> Nesting | None:
     """Places shapes on the best rectangle found, or returns None if none is large enough.
 
-    The best rectangle is small and nearly square, and exceeds `PREFERRED_SIDE` and `USUAL_SIDES`
-    only if it must. The result is deterministic.
+    The best rectangle is small and nearly square. It exceeds `PREFERRED_SIDE` and `USUAL_SIDES`
+    only if there is no other. The result is deterministic.
 
     Args:
-        shapes: at least one.
-        wall: the least distance between two outlines and to the rectangle's edge, in metres.
+        shapes: at least one shape.
+        wall: the least distance between two outlines, and of an outline from the rectangle's edge,
+            in metres.
     """
     parts = [[_Part(shape, yaw, wall) for yaw in _YAWS_DEG] for shape in shapes]
     sizes = [int(rotated[0].walled.sum()) for rotated in parts]
@@ -114,19 +119,20 @@ def nest_on(
     """Places shapes on a rectangle of a given size, or returns None if no placement is found.
 
     Args:
-        shapes: at least one.
-        wall: see `nest`.
+        shapes: at least one shape.
+        wall: the least distance between two outlines, and of an outline from the rectangle's edge,
+            in metres.
         room: the rectangle's length along x and width along y, in metres.
 
     Returns:
-        The nesting, of the rectangle's size and centred in it.
+        The nesting; its shapes are centred on the given rectangle.
     """
     parts = [[_Part(shape, yaw, wall) for yaw in _YAWS_DEG] for shape in shapes]
     sizes = [int(rotated[0].walled.sum()) for rotated in parts]
     extents = [max(rotated[0].size) for rotated in parts]
     largest_first = sorted(range(len(shapes)), key=lambda i: -sizes[i])
     longest_first = sorted(range(len(shapes)), key=lambda i: -extents[i])
-    # Masks are conservative: shapes that miss by a cell or two on the raster may still fit.
+    # The masks are conservative: shapes that overlap by a cell or two on the raster may still fit.
     for order, lengthwise, excess in itertools.product(
         (largest_first, longest_first), (True, False), (0, 1, 2)
     ):
@@ -143,7 +149,10 @@ def nest_on(
 
 
 def _on(nesting: Nesting, room: tuple[float, float], lengthwise: bool) -> Nesting | None:
-    """A nesting centred in a larger rectangle, possibly turned by 90 degrees; None if too large."""
+    """Centres a nesting on a larger rectangle; turns it by 90 degrees unless `lengthwise`.
+
+    Returns None if the nesting is too large.
+    """
     length, width = room if lengthwise else room[::-1]
     if nesting.length > length + 1e-9 or nesting.width > width + 1e-9:
         return None
@@ -162,15 +171,16 @@ def _cost(length: float, width: float) -> float:
 
 
 class _Part:
-    """Masks of a rotated shape: rows along y, columns along x, all of one size.
+    """Masks of a rotated shape, all of one size: rows along y, columns along x.
 
     The lower left corner of the outline with its wall is at cell `inset` (row, column).
     """
 
     def __init__(self, shape: NestedShape, yaw_deg: int, wall: float) -> None:
         self.yaw_deg = yaw_deg
-        # `solid` has every cell that the outline touches. If none of them is in another shape's
-        # `walled`, the outlines keep the wall; if none is in its `keep_out`, they stay clear of it.
+        # `solid` has every cell that the outline touches. Two shapes keep the wall between them if
+        # no cell of one's `solid` is in the other's `walled`. They respect keep-out areas if no
+        # cell of one's `solid` is in the other's `keep_out`.
         solid = _grown(shape.outline.rotate(yaw_deg), _REACH)
         walled = _grown(shape.outline.rotate(yaw_deg), wall + _REACH)
         keep_out = _grown(shape.keep_out.rotate(yaw_deg), _REACH)
@@ -188,7 +198,7 @@ class _Part:
         self._spectra: dict[tuple[int, int], tuple[Spectrum, Spectrum]] = {}
 
     def spectra(self, canvas: tuple[int, int]) -> tuple[Spectrum, Spectrum]:
-        """Conjugate spectra of the masks to test against other shapes' solids and keep-outs."""
+        """Returns the conjugate spectra of the masks that are tested against other shapes."""
         if canvas not in self._spectra:
             self._spectra[canvas] = (
                 np.conj(_transform(self.on_canvas(self.walled | self.keep_out, canvas, (0, 0)))),
@@ -197,14 +207,13 @@ class _Part:
         return self._spectra[canvas]
 
     def on_canvas(self, mask: Mask, canvas: tuple[int, int], place: tuple[int, int]) -> Mask:
-        """A mask on a cyclic canvas, with its `inset` corner at `place`."""
+        """Puts a mask on a cyclic canvas, with its `inset` corner at `place` (row, column)."""
         result = np.zeros(canvas, dtype=bool)
         result[: mask.shape[0], : mask.shape[1]] = mask
         return np.roll(result, (place[0] - self.inset[0], place[1] - self.inset[1]), axis=(0, 1))
 
 
 def _transform(mask: Mask) -> Spectrum:
-    # Import SciPy lazily.
     from scipy import fft
 
     return fft.rfft2(mask.astype(np.float32))
@@ -224,10 +233,10 @@ def rasterized(
     counts: tuple[int, int],
     cell: float = CELL,
 ) -> Mask:
-    """The mask of the cells whose centres are inside an outline.
+    """Returns the mask of the cells whose centres are inside an outline.
 
     Args:
-        outline: in metres; not empty.
+        outline: the outline in metres; not empty.
         start: (x, y) of the raster's lower left corner, in metres.
         counts: the numbers of cells along y and x.
         cell: the side of a cell, in metres.
@@ -239,7 +248,7 @@ def rasterized(
     row, edge = np.nonzero((a[:, 1] <= rows) != (b[:, 1] <= rows))
     (a_x, a_y), (b_x, b_y) = a[edge].T, b[edge].T
     crossing = a_x + (row - a_y) / (b_y - a_y) * (b_x - a_x)
-    # A cell is inside if an odd number of crossings is left of it.
+    # A cell is inside if the number of crossings to its left is odd.
     flips = np.zeros((counts[0], counts[1] + 1), dtype=np.int64)
     np.add.at(flips, (row, np.clip(np.ceil(crossing), 0, counts[1]).astype(int)), 1)
     return np.cumsum(flips, axis=1)[:, :-1] % 2 == 1
@@ -253,15 +262,20 @@ def _fill_strip(
 ) -> list[_Placement] | None:
     """Places one part of each list in a strip of (rows, columns), each as low as possible.
 
+    Args:
+        parts: for each shape, its masks at the angles to try.
+        order: the order in which the shapes are placed.
+        strip: the rows and columns of the strip.
+        limit: the cost above which the strip is abandoned.
+
     Returns:
-        The part and the (row, column) of its corner for each list. None if they do not fit or if
-        they would cost more than the limit.
+        For each shape, the chosen part and the (row, column) of its corner. None if the shapes do
+        not fit or cost more than the limit.
     """
-    # Import SciPy lazily.
     from scipy import fft
 
-    # Keep-outs may reach out of the strip. The canvas is cyclic, as the Fourier transform is, so
-    # they then wrap around into this margin.
+    # The canvas is cyclic, because the Fourier transform is. This margin takes up the keep-out
+    # areas that reach beyond the strip and wrap around.
     overhang = max(
         max(part.solid.shape[axis] - part.size[axis] for axis in (0, 1))
         for rotated in parts
@@ -301,12 +315,11 @@ def _lowest_place(
     rows, columns = strip[0] - part.size[0] + 1, strip[1] - part.size[1] + 1
     if rows <= 0 or columns <= 0:
         return None
-    # Import SciPy lazily.
     from scipy import fft
 
     against_solid, against_keep_out = part.spectra(canvas)
     overlap = fft.irfft2(taken[0] * against_solid + taken[1] * against_keep_out, s=canvas)
-    # An overlap is a whole number of cells.
+    # A correlation counts cells, so round it to a whole number.
     free = overlap[:rows, :columns] < 0.5
     first = int(np.argmax(free))
     row, column = divmod(first, columns)
@@ -316,7 +329,7 @@ def _lowest_place(
 def _tightened(
     shapes: Sequence[NestedShape], placements: Sequence[_Placement], wall: float
 ) -> Nesting:
-    """The nesting on the smallest rectangle around the placed shapes."""
+    """Shrinks the rectangle of a nesting to the smallest around the placed shapes."""
     origins = [CELL * np.array([column, row]) - part.corner for part, (row, column) in placements]
     bounds = np.array(
         [

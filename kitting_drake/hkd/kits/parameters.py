@@ -5,17 +5,17 @@ from dataclasses import dataclass, replace
 from systems.bounds import bounded
 
 TIGHT = 0.001
-"""Cavities with less clearance than this, in metres, need finer contact geometry."""
+"""The clearance in metres below which a cavity is tight and needs finer contact geometry."""
 _FINEST = 5e-6
-"""The least tolerance of a tight cavity, in metres."""
+"""The smallest tolerance of a tight cavity's outline, in metres."""
 
 
 @dataclass
 class KitParameters:
     """The template of the kit block. Lengths in m."""
 
-    # The block's extents along x, y and z. Length and width apply to a block with the slots of a
-    # toolset, and to a nested block if `fixed_size` is set.
+    # The block's extents along x, y and z. A nested block has this length and width only if
+    # `fixed_size` is set.
     length: float = bounded(0.280, 0.05, 1.0)
     width: float = bounded(0.260, 0.05, 1.0)
     height: float = bounded(0.050, 0.01, 0.2)
@@ -31,7 +31,7 @@ class KitParameters:
     # Width and depth of the bevel around the rim, which leads a tool in.
     lead_in: float = bounded(0.001, 0.0, 0.005)
 
-    # The largest deviation of the straight edges from the exact walls.
+    # The largest deviation of the simplified outline from the exact wall.
     tolerance: float = bounded(0.0001, 1e-6, 0.001)
 
     # The least wall thickness between two cavities, and below a cavity.
@@ -40,18 +40,18 @@ class KitParameters:
     # The wall thickness between and around nested cavities.
     nested_wall: float = bounded(0.006, 0.001, 0.05)
 
-    # Nest the tools even where they fit the slots of a toolset.
+    # Whether to nest the tools even if they fit the slots of a toolset.
     always_nested: bool = False
 
-    # Give a nested block the length and width above, instead of the smallest size found.
+    # Whether a nested block has the length and width above instead of the smallest size found.
     fixed_size: bool = False
 
     @property
     def is_tight(self) -> bool:
-        """Whether the clearance needs finer contact geometry."""
+        """Whether the clearance is so small that finer contact geometry is needed."""
         return self.clearance < TIGHT
 
     def with_fine_walls(self) -> "KitParameters":
-        """The parameters with a tolerance that suits a tight clearance."""
+        """Returns the parameters with a tolerance that suits the clearance, if that is tight."""
         finest = max(self.clearance / 20, _FINEST)
         return replace(self, tolerance=min(self.tolerance, finest)) if self.is_tight else self

@@ -17,40 +17,50 @@ if TYPE_CHECKING:
 
 def describe_trace(tracer: argparse.ArgumentParser) -> None:
     """Adds the arguments of `hkd trace`."""
-    tracer.add_argument("photo", type=Path, metavar="PHOTO", help="a photo from above (JPEG, PNG)")
+    tracer.add_argument(
+        "photo", type=Path, metavar="PHOTO", help="a photo of the tools from above (JPEG, PNG)"
+    )
     tracer.add_argument("--output", type=Path, required=True, metavar="DIR", help="the folder")
     tracer.add_argument(
         "--sheet",
         nargs="+",
         metavar="SIZE",
-        help="a4, letter, or two sides in mm (default: A4 or Letter, as it looks)",
+        help="a4, letter, or two sides in mm (default: A4 or Letter, by its proportions)",
     )
     tracer.add_argument(
         "--height_mm",
         type=float,
         nargs="+",
         metavar="MM",
-        help="height of the tools as they lie: one for all, or one for each from left to right",
+        help="height of the tools above the ground, in mm: one for all, or one for each from "
+        "left to right",
     )
     tracer.add_argument(
         "--edges",
         choices=("upright", "round"),
         default="upright",
-        help="the tools' sides: upright from foot to top, or round with the edge at half the "
+        help="shape of the tools' sides: upright, or round with the widest point at half the "
         "height (default: upright)",
     )
     tracer.add_argument(
-        "--camera_mm", type=float, metavar="MM", help="height of the camera (default: by its lens)"
+        "--camera_mm",
+        type=float,
+        metavar="MM",
+        help="height of the camera above the ground, in mm (default: from the focal length)",
     )
     tracer.add_argument(
-        "--points", type=Path, metavar="FILE", help="corrections (YAML): see docs/printing.md"
+        "--points",
+        type=Path,
+        metavar="FILE",
+        help="a file of corrections (YAML): see docs/printing.md",
     )
-    tracer.add_argument("--name", help="name of the outlines (default: the photo's)")
+    tracer.add_argument("--name", help="name of the outlines (default: the photo's name)")
     tracer.add_argument(
         "--category",
         nargs="+",
         metavar="NAME",
-        help="also import the outlines as tools of this category, or of one each",
+        help="also import the outlines as tools: one category for all, or one for each from left "
+        "to right",
     )
     scales = tracer.add_argument_group("scale without a sheet")
     scales.add_argument(
@@ -58,10 +68,20 @@ def describe_trace(tracer: argparse.ArgumentParser) -> None:
         type=float,
         nargs=4,
         metavar=("U1", "V1", "U2", "V2"),
-        help="two points in the photo, for instance on a ruler, in pixels",
+        help="two points in the photo, in pixels, for instance on a ruler",
     )
-    scales.add_argument("--scale_mm", type=float, metavar="MM", help="the distance between them")
-    scales.add_argument("--disc_mm", type=float, metavar="MM", help="the diameter of a coin")
+    scales.add_argument(
+        "--scale_mm",
+        type=float,
+        metavar="MM",
+        help="the distance between the two points of --scale_px, in mm",
+    )
+    scales.add_argument(
+        "--disc_mm",
+        type=float,
+        metavar="MM",
+        help="the diameter, in mm, of a coin beside the tools",
+    )
     scales.add_argument(
         "--board",
         type=float,
@@ -70,7 +90,9 @@ def describe_trace(tracer: argparse.ArgumentParser) -> None:
         help="a ChArUco board beside the tools",
     )
     scales.add_argument(
-        "--dictionary", default="DICT_4X4_50", help="of the board's markers (DICT_4X4_50)"
+        "--dictionary",
+        default="DICT_4X4_50",
+        help="OpenCV's name of the board's marker dictionary (default: DICT_4X4_50)",
     )
     tracer.add_argument("--quiet", action="store_true", help="print nothing but errors")
 
@@ -81,12 +103,12 @@ def trace_photo(args: argparse.Namespace) -> None:
     Raises:
         UserError: the arguments or the photo cannot be used.
     """
-    # OpenCV and the importer are slow to import, and only this verb needs them.
+    # Import lazily: OpenCV and the importer are slow to import.
     from kitting_drake.hkd.importing.importer import ImportRequest, import_tool
     from kitting_drake.hkd.tracing.tracer import TraceRequest, trace
 
     if args.category and not args.height_mm:
-        raise UserError("--category makes tools, whose height is needed: give --height_mm")
+        raise UserError("--category needs the tools' height: give --height_mm")
     request = TraceRequest(
         photo=args.photo,
         output=args.output,
@@ -113,8 +135,8 @@ def trace_photo(args: argparse.Namespace) -> None:
     categories = args.category * len(report.tools) if len(args.category) == 1 else args.category
     if len(categories) != len(report.tools):
         raise UserError(
-            f"--category has {len(categories)} names for {len(report.tools)} tools: give one, or "
-            "one for each from left to right"
+            f"--category has {len(categories)} names, and the photo shows {len(report.tools)} "
+            "tools: give one name, or one for each tool from left to right"
         )
     made = []
     for tool, category in zip(report.tools, categories, strict=True):
@@ -156,16 +178,16 @@ def _scale(args: argparse.Namespace) -> "Scale | None":
     from kitting_drake.hkd.tracing.scales import Scale
 
     if (args.scale_px is None) != (args.scale_mm is None):
-        raise UserError("--scale_px and --scale_mm belong together: give both")
+        raise UserError("give both --scale_px and --scale_mm, or neither")
     kinds = {"--sheet": args.sheet, "--scale_px": args.scale_px, "--disc_mm": args.disc_mm}
     given = [flag for flag, value in (kinds | {"--board": args.board}).items() if value is not None]
     if len(given) > 1:
-        raise UserError(f"{' and '.join(given)} are two scales: give one")
+        raise UserError(f"{' and '.join(given)} each set the scale: give one of them")
     if args.scale_px is not None:
         return Scale(points=tuple(args.scale_px), length_mm=args.scale_mm)
     if args.disc_mm is not None:
         if not 5 <= args.disc_mm <= 300:
-            raise UserError(f"--disc_mm {args.disc_mm:g} is out of range: give 5 to 300")
+            raise UserError(f"--disc_mm is {args.disc_mm:g}, out of range: give 5 to 300")
         return Scale(disc_mm=args.disc_mm)
     if args.board is not None:
         columns, rows, square, marker = args.board

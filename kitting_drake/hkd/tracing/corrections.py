@@ -1,4 +1,4 @@
-"""A user's corrections of a trace, from the file of `--points`."""
+"""A user's corrections of a trace, read from the file of `--points`."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,15 +15,16 @@ _KINDS = ("add", "remove", "sheet")
 
 @dataclass(frozen=True)
 class Corrections:
-    """Polygons to add and remove, in order, and the sheet's corners."""
+    """Polygons to add to and remove from the traced area, in order, and the sheet's corners."""
 
     steps: tuple[tuple[str, NDArray[np.float64]], ...] = ()
-    """`add` or `remove`, and a polygon (n, 2) in mm on the picture's rulers."""
+    """Pairs of a verb, `add` or `remove`, and a polygon (n, 2) in mm on the picture's rulers."""
     corners: NDArray[np.float64] | None = None
-    """(4, 2) the sheet's corners in pixels of the photo, counter-clockwise as seen."""
+    """The sheet's corners (4, 2) in pixels of the photo, counter-clockwise in the picture; None:
+    found automatically."""
 
     def applied(self, area: CrossSection) -> CrossSection:
-        """An area with the polygons added and removed."""
+        """Returns an area with the polygons added and removed."""
         for kind, points in self.steps:
             polygon = CrossSection([points], FillRule.EvenOdd)
             area = area + polygon if kind == "add" else area - polygon
@@ -34,7 +35,7 @@ def read_corrections(path: Path) -> Corrections:
     """Reads a YAML list of items `add: [[x, y], ...]`, `remove: [[x, y], ...]` and `sheet: ...`.
 
     Raises:
-        UserError: the file is missing or not such a list; names the item.
+        UserError: the file is missing, or is not such a list. The message names the item.
     """
     try:
         items = yaml.safe_load(path.read_text())
@@ -70,6 +71,6 @@ def _points(value: object, where: str) -> NDArray[np.float64]:
 
 
 def _ordered(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Corners counter-clockwise as seen; rows point down."""
+    """Orders corners (4, 2) in pixels so that they run counter-clockwise in the picture."""
     away = corners - corners.mean(axis=0)
     return corners[np.argsort(-np.arctan2(away[:, 1], away[:, 0]))]

@@ -1,4 +1,4 @@
-"""Evens out the light on a plain ground, so that what lies on it stands out."""
+"""Evens out the light on a plain ground, so that the objects on it stand out."""
 
 from typing import Any
 
@@ -10,25 +10,30 @@ from kitting_drake.hkd.tracing.photo_file import linear
 Array = NDArray[Any]
 
 _FLOOR = 0.012
-"""Added to linear values, so that noise in the dark is not a difference."""
+"""A value added to linear light before the logarithm, so that noise in dark areas stays small."""
 _SMOOTH_MM = 20.0
 _FIT_POINTS = 20_000
 
 
 def log_light(pixels: Array) -> Array:
-    """(rows, columns, 3) logarithms of linear light."""
+    """Returns the logarithm (rows, columns, 3) of the linear light of sRGB pixels of the same
+    shape."""
     codes = np.arange(256, dtype=np.uint8)
     return np.log(linear(codes) + np.float32(_FLOOR))[pixels]
 
 
 def flattened(cv2: Any, logs: Array, ground: Array, px_per_mm: float) -> tuple[Array, float]:
-    """The logarithm of each pixel's ratio to the ground there, and the ground's own spread.
+    """Divides each pixel by the ground's light at that pixel, as a difference of logarithms.
 
     Args:
         cv2: OpenCV.
         logs: (rows, columns, 3) from `log_light`.
-        ground: (rows, columns) where the ground may be seen.
+        ground: (rows, columns) true where the ground may be visible.
         px_per_mm: the resolution.
+
+    Returns:
+        The logarithm (rows, columns, 3) of each pixel's ratio to the ground, and the standard
+        deviation of this logarithm on the ground.
     """
     rows, columns = ground.shape
     v, u = np.nonzero(ground)
@@ -48,7 +53,7 @@ def flattened(cv2: Any, logs: Array, ground: Array, px_per_mm: float) -> tuple[A
     residual = values - design @ coefficients
     near = np.abs(residual).max(axis=1) < 0.15
     spread = 1.4826 * float(np.median(np.abs(residual[near]))) if near.sum() > 50 else 0.15
-    # Subtract the light that the polynomial missed, by a blur of the ground that is seen.
+    # The polynomial misses some of the light's unevenness: subtract a blur of the visible ground.
     plain = (ground & (_largest(ratio) < max(0.06, 3 * spread))).astype(np.float32)
     step = max(1, int(px_per_mm))
     small = cv2.resize(plain, None, fx=1 / step, fy=1 / step, interpolation=cv2.INTER_AREA)
@@ -64,7 +69,7 @@ def flattened(cv2: Any, logs: Array, ground: Array, px_per_mm: float) -> tuple[A
 
 
 def _largest(ratio: Array) -> Array:
-    """The largest size of the three values of each pixel."""
+    """Returns the largest absolute value (rows, columns) of each pixel's three channels."""
     a, b, c = (np.abs(ratio[..., k]) for k in range(3))
     return np.maximum(np.maximum(a, b), c)
 
@@ -74,7 +79,8 @@ def _terms(x: Array, y: Array) -> Array:
 
 
 def _robust_fit(design: Array, values: Array) -> Array:
-    """(6, 3) coefficients that follow most of the values, by Tukey's weights."""
+    """Fits coefficients (6, 3) by least squares with Tukey's weights, so that outliers do not
+    count."""
     # Start from the most frequent lightness.
     light = values.mean(axis=1)
     counts, edges = np.histogram(light, bins=60)

@@ -1,4 +1,4 @@
-"""Reads a photo and its EXIF data on the lens."""
+"""Reads a photo and the EXIF data on its lens."""
 
 import math
 import warnings
@@ -14,35 +14,36 @@ from kitting_drake.common.errors import UserError
 
 _DIAGONAL_35MM = math.hypot(36, 24)
 ASSUMED_FOCAL_35MM = 26.0
-"""The main lens of most phones: 24 to 28 mm, as if for film of 35 mm."""
+"""The 35 mm equivalent focal length of most phones' main lens, which is 24 to 28 mm."""
 _LEAST_SIDE = 500
 _MOST_PIXELS = 110_000_000
 
 
 @dataclass(frozen=True)
 class Photo:
-    """A photo, upright."""
+    """A photo, turned upright."""
 
     path: Path
     pixels: NDArray[np.uint8]
-    """(rows, columns, 3) RGB."""
+    """The RGB pixels (rows, columns, 3)."""
     focal_35mm: float | None
-    """The focal length that the photo tells, as if for film of 35 mm."""
+    """The 35 mm equivalent focal length in the EXIF data, in mm; None if there is none."""
     cropped: bool = False
-    """Whether the photo is another shape than the camera says."""
+    """Whether the photo's aspect ratio differs from the one in the EXIF data."""
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height in pixels."""
+        """The width and height in pixels."""
         return self.pixels.shape[1], self.pixels.shape[0]
 
     @property
     def center(self) -> NDArray[np.float64]:
-        """The middle, from pixel centres."""
+        """The middle of the photo in pixels, where whole numbers are pixel centres."""
         return (np.array(self.size) - 1) / 2
 
     def focal_px(self, focal_35mm: float) -> float:
-        """A focal length in pixels; the equivalent is by the diagonal (CIPA DCG-001)."""
+        """Converts a 35 mm equivalent focal length to pixels, by the image's diagonal (CIPA
+        DCG-001)."""
         return focal_35mm / _DIAGONAL_35MM * math.hypot(*self.size)
 
 
@@ -59,7 +60,7 @@ def read_photo(path: Path) -> Photo:
                 if opened.width * opened.height > _MOST_PIXELS:
                     raise UserError(
                         f"{path} has {opened.width} x {opened.height} pixels, more than "
-                        f"{_MOST_PIXELS / 1e6:.0f} million: make it smaller"
+                        f"{_MOST_PIXELS / 1000000.0:.0f} million: reduce its size"
                     )
                 inner = dict(opened.getexif().get_ifd(ExifTags.IFD.Exif))
                 upright = ImageOps.exif_transpose(opened)
@@ -69,14 +70,14 @@ def read_photo(path: Path) -> Photo:
         raise
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         if not path.exists():
-            raise UserError(f"there is no file {path}: give a photo (JPEG, PNG)") from error
+            raise UserError(f"there is no file {path}: give a photo (JPEG or PNG)") from error
         raise UserError(
             f"{path} cannot be read as a photo: give a JPEG or a PNG (convert a HEIC first)"
         ) from error
     if min(pixels.shape[:2]) < _LEAST_SIDE:
         raise UserError(
-            f"{path} has {pixels.shape[1]} x {pixels.shape[0]} pixels: "
-            f"give a photo of at least {_LEAST_SIDE} pixels a side"
+            f"{path} has {pixels.shape[1]} x {pixels.shape[0]} pixels: give a photo with at least "
+            f"{_LEAST_SIDE} pixels on each side"
         )
     tags = ExifTags.Base
     focal = _number(inner.get(tags.FocalLengthIn35mmFilm))
@@ -96,7 +97,7 @@ def _number(value: Any) -> float | None:
 
 
 def linear(pixels: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Linear light, 0 to 1, of sRGB pixels."""
+    """Converts sRGB pixels of 8 bits to linear light from 0 to 1."""
     codes = np.arange(256, dtype=np.float32) / 255
     table = np.where(codes <= 0.04045, codes / 12.92, ((codes + 0.055) / 1.055) ** 2.4)
     return table.astype(np.float32)[pixels]

@@ -10,46 +10,52 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 _TELLING_TILT = math.radians(14)
-"""The perspective of a sheet tells the focal length only if it is seen more obliquely."""
+"""The least tilt, in radians, at which a sheet's perspective determines the focal length well."""
 
 
 @dataclass(frozen=True)
 class PlaneView:
     """The map between the plane, in mm, and an undistorted photo, in pixels.
 
-    In the plane's frame x and y are in the plane and z points to the camera.
+    The x and y axes of the plane's frame lie in the plane; z points to the camera's side.
     """
 
     homography: Array
-    """(3, 3) from the plane to pixels."""
+    """The homography (3, 3) that maps points of the plane to pixels."""
     focal_px: float
     camera: Array
-    """(3,) the camera's position above the plane, in mm."""
+    """The camera's position (3,) in the plane's frame, in mm."""
     tilt: float
-    """The angle between the line of sight and the plane's normal, in radians."""
+    """The angle between the camera's optical axis and the plane's normal, in radians."""
 
     def to_pixels(self, points: Array) -> Array:
-        """(n, 2) pixels of points (n, 2) in mm."""
+        """Maps points (n, 2) of the plane in mm to pixels (n, 2)."""
         return mapped(self.homography, points)
 
     def to_plane(self, pixels: Array) -> Array:
-        """(n, 2) points in mm of pixels (n, 2)."""
+        """Maps pixels (n, 2) to points (n, 2) of the plane in mm."""
         return mapped(np.asarray(np.linalg.inv(self.homography), float), pixels)
 
     def px_per_mm(self, point: Array) -> float:
-        """The photo's resolution at a point (2,) of the plane."""
+        """The photo's resolution at a point (2,) of the plane, in pixels per mm."""
         near = self.to_pixels(np.array([point, point + (1, 0), point + (0, 1)]))
         return float(math.sqrt(abs(np.linalg.det(near[1:] - near[0]))))
 
 
 def mapped(homography: Array, points: Array) -> Array:
-    """Points (n, 2) mapped by a homography."""
+    """Maps points (n, 2) by a homography (3, 3)."""
     image = np.c_[np.asarray(points, float), np.ones(len(points))] @ homography.T
     return image[:, :2] / image[:, 2:]
 
 
 def view_of(homography: Array, focal_px: float, center: Array) -> PlaneView:
-    """The view with the homography's camera pose."""
+    """Returns the view of a plane, with the camera's pose computed from a homography.
+
+    Args:
+        homography: (3, 3) from the plane in mm to pixels.
+        focal_px: the focal length in pixels.
+        center: (2,) the principal point in pixels.
+    """
     rotation, shift = _pose(homography, focal_px, center)
     camera = -rotation.T @ shift
     return PlaneView(homography, focal_px, camera, float(math.acos(min(1, -rotation[2, 2]))))
@@ -71,14 +77,22 @@ def _centred(homography: Array, center: Array) -> Array:
 
 
 def focal_of_homography(homography: Array, center: Array) -> float | None:
-    """The focal length in pixels by which the plane's axes are perpendicular and equally scaled.
+    """Computes the focal length in pixels from the perspective of a plane.
 
-    None: the plane is seen too squarely to tell.
+    It is the focal length at which the plane's axes are perpendicular and equally scaled.
+
+    Args:
+        homography: (3, 3) from the plane in mm to pixels.
+        center: (2,) the principal point in pixels.
+
+    Returns:
+        The focal length, or None if the view is too close to perpendicular to determine it.
     """
     h = _centred(homography, center)
     h = h / np.linalg.norm(h)
     a, b = h[:, 0], h[:, 1]
-    # With w = 1/f^2: w (a1 b1 + a2 b2) = -a3 b3 and w (|a12|^2 - |b12|^2) = b3^2 - a3^2.
+    # With w = 1/f^2, perpendicular axes require w (a1 b1 + a2 b2) = -a3 b3, and equal scales w
+    # (|a12|^2 - |b12|^2) = b3^2 - a3^2.
     left = np.array([a[:2] @ b[:2], (a[:2] @ a[:2] - b[:2] @ b[:2]) / 2])
     right = np.array([-a[2] * b[2], (b[2] ** 2 - a[2] ** 2) / 2])
     w = float(left @ right) / max(float(left @ left), 1e-30)
@@ -90,22 +104,35 @@ def focal_of_homography(homography: Array, center: Array) -> float | None:
 
 
 def focal_of_height(homography: Array, height: float, start_px: float, center: Array) -> float:
-    """The focal length in pixels that puts the camera at a height in mm above the plane."""
+    """Finds the focal length in pixels that puts the camera at a given height above the plane.
+
+    Args:
+        homography: (3, 3) from the plane in mm to pixels.
+        height: the camera's height in mm.
+        start_px: the focal length at which the search starts.
+        center: (2,) the principal point in pixels.
+    """
     focal = start_px
-    # Seen squarely, the camera's height grows with the focal length.
+    # In a perpendicular view, the camera's height is proportional to the focal length.
     for _ in range(20):
         focal *= height / view_of(homography, focal, center).camera[2]
     return focal
 
 
 def aspect_of_quad(corners: Array, focal_px: float, center: Array) -> float:
-    """The ratio of the first side to the second of a rectangle seen as corners (4, 2) in pixels."""
+    """Computes the ratio of the first side of a rectangle to the second.
+
+    Args:
+        corners: (4, 2) the rectangle's corners in pixels.
+        focal_px: the focal length in pixels.
+        center: (2,) the principal point in pixels.
+    """
     h = _centred(square_to(corners), center) / np.array([[focal_px], [focal_px], [1.0]])
     return float(np.linalg.norm(h[:, 0]) / np.linalg.norm(h[:, 1]))
 
 
 def square_to(corners: Array) -> Array:
-    """The homography from (0, 0), (1, 0), (1, 1), (0, 1) to corners (4, 2)."""
+    """Returns the homography (3, 3) that maps (0, 0), (1, 0), (1, 1), (0, 1) to corners (4, 2)."""
     square = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float)
     rows = []
     for (x, y), (u, v) in zip(square, corners, strict=True):
@@ -117,35 +144,37 @@ def square_to(corners: Array) -> Array:
 
 @dataclass(frozen=True)
 class RectifiedPhoto:
-    """The plane seen from above at an even scale."""
+    """The plane as seen from straight above, at the same scale everywhere."""
 
     pixels: Any
-    """(rows, columns, 3) RGB, 8 bits."""
+    """The RGB pixels (rows, columns, 3), 8 bits each."""
     seen: Any
-    """(rows, columns) whether the photo shows this."""
+    """A mask (rows, columns) of the pixels that the photo shows."""
     px_per_mm: float
     low: Array
-    """(2,) the lower left corner of the picture, in mm."""
+    """The lower left corner (2,) of the picture, in mm."""
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns."""
+        """The numbers of rows and columns."""
         return self.pixels.shape[:2]
 
     @property
     def high(self) -> Array:
-        """(2,) the upper right corner, in mm."""
+        """The upper right corner (2,) of the picture, in mm."""
         rows, columns = self.shape
         return self.low + np.array([columns, rows]) / self.px_per_mm
 
     def to_mm(self, pixels: Array) -> Array:
-        """Points (n, 2) in mm of columns and rows (n, 2), from pixel centres."""
+        """Converts columns and rows (n, 2), where whole numbers are pixel centres, to points (n, 2)
+        in mm."""
         x, y = np.asarray(pixels, float).T
         top = self.high[1]
         return np.c_[self.low[0] + (x + 0.5) / self.px_per_mm, top - (y + 0.5) / self.px_per_mm]
 
     def to_px(self, points: Array) -> Array:
-        """Columns and rows (n, 2) of points (n, 2) in mm."""
+        """Converts points (n, 2) in mm to columns and rows (n, 2), where whole numbers are pixel
+        centres."""
         x, y = np.asarray(points, float).T
         return np.c_[
             (x - self.low[0]) * self.px_per_mm - 0.5, (self.high[1] - y) * self.px_per_mm - 0.5
@@ -155,7 +184,16 @@ class RectifiedPhoto:
 def rectify(
     cv2: Any, pixels: Any, view: PlaneView, low: Array, high: Array, px_per_mm: float
 ) -> RectifiedPhoto:
-    """The part of the plane from `low` to `high`, in mm, seen from above."""
+    """Shows the part of the plane from `low` to `high` as from straight above.
+
+    Args:
+        cv2: OpenCV.
+        pixels: (rows, columns, 3) the photo.
+        view: the view of the plane.
+        low: (2,) the lower left corner of the part, in mm.
+        high: (2,) the upper right corner of the part, in mm.
+        px_per_mm: the resolution of the result.
+    """
     columns, rows = (np.ceil((high - low) * px_per_mm)).astype(int).tolist()
     top = low[1] + rows / px_per_mm
     to_plane = np.array(
@@ -168,12 +206,12 @@ def rectify(
     H = view.homography @ to_plane
     fine = view.px_per_mm((low + high) / 2)
     if fine > 1.3 * px_per_mm:
-        # Average over a pixel of the result.
+        # Average the photo over the area of a pixel of the result.
         pixels = cv2.GaussianBlur(pixels, (0, 0), 0.4 * fine / px_per_mm)
     flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
     image = cv2.warpPerspective(pixels, H, (columns, rows), flags=flags)
     inside = np.full(pixels.shape[:2], 255, np.uint8)
     seen = cv2.warpPerspective(inside, H, (columns, rows), flags=cv2.WARP_INVERSE_MAP)
-    # The photo's very edge is mixed with what is beyond it.
+    # The photo's outermost pixels are interpolated with the empty area beyond them.
     seen = cv2.erode(seen, np.ones((7, 7), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
     return RectifiedPhoto(image, seen > 250, px_per_mm, np.asarray(low, float))

@@ -1,4 +1,4 @@
-"""The plane of a photo by a ruler, a disc or a ChArUco board of known size."""
+"""Finds the plane of a photo from a ruler, a disc or a ChArUco board of known size."""
 
 import math
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from kitting_drake.hkd.tracing.sheet_plane import GroundPlane
 Array = NDArray[np.float64]
 
 _COIN_MM = 2.0
-"""The height of a coin."""
+"""The assumed height of a coin, in mm."""
 _ROUNDEST_TILT = math.radians(10)
 _MARGIN_MM = 3.0
 _LEAST_CORNERS = 6
@@ -29,25 +29,34 @@ _SMALL_SIDE = 1200
 
 @dataclass(frozen=True)
 class Scale:
-    """Something of known size: one of the three fields is set."""
+    """An object of known size in the photo: exactly one of `points`, `disc_mm` and `board` is
+    set."""
 
     points: tuple[float, float, float, float] | None = None
     """Two points u1, v1, u2, v2 of the photo, in pixels, for instance on a ruler."""
     length_mm: float = 0.0
-    """Between these points."""
+    """The distance between the two points."""
     disc_mm: float | None = None
     """The diameter of a disc or coin."""
     board: tuple[int, int, float, float] | None = None
     """Columns, rows, and the sides of a square and a marker of a ChArUco board, in mm."""
     dictionary: str = "DICT_4X4_50"
-    """Of the board's markers."""
+    """OpenCV's name of the dictionary of the board's markers."""
 
 
 def plane_of_scale(cv2: Any, photo: Photo, scale: Scale, camera_mm: float | None) -> GroundPlane:
-    """The plane by a scale. A ruler and a disc need a photo from straight above.
+    """Finds the plane from an object of known size.
+
+    With two points or a disc, the photo must be taken from straight above.
+
+    Args:
+        cv2: OpenCV.
+        photo: the photo.
+        scale: the object of known size.
+        camera_mm: the camera's height above the plane in mm; None: computed from the focal length.
 
     Raises:
-        UserError: the scale is not seen, or seen twice, or the photo is oblique.
+        UserError: the object is not seen, or is seen twice, or the photo is oblique.
     """
     if scale.board is not None:
         return _by_board(cv2, photo, scale, camera_mm)
@@ -55,7 +64,7 @@ def plane_of_scale(cv2: Any, photo: Photo, scale: Scale, camera_mm: float | None
         center, radius = _find_disc(cv2, photo)
         px_per_mm = 2 * radius / scale.disc_mm
         focal, told = _focal(photo, px_per_mm, camera_mm)
-        # The disc's rim is nearer to the camera than the plane.
+        # The disc's rim is closer to the camera than the plane is, by the disc's thickness.
         camera = focal / px_per_mm + _COIN_MM
         px_per_mm = focal / camera
         note = f"a disc of {scale.disc_mm:g} mm, {_COIN_MM:g} mm high"
@@ -71,16 +80,18 @@ def plane_of_scale(cv2: Any, photo: Photo, scale: Scale, camera_mm: float | None
         )
     px_per_mm = distance / scale.length_mm
     focal, told = _focal(photo, px_per_mm, camera_mm)
-    note = f"{px_per_mm:.2f} pixels to the mm, by two points"
+    note = f"{px_per_mm:.2f} pixels per mm, from two points"
     return _straight_down(photo, px_per_mm, focal, [note, told], None)
 
 
 def _focal(photo: Photo, px_per_mm: float, camera_mm: float | None) -> tuple[float, str]:
-    """The focal length in pixels, and a note on it."""
+    """Returns the focal length in pixels, and a note on its source."""
     if camera_mm is not None:
         return px_per_mm * camera_mm, f"the camera {camera_mm:g} mm above, as given"
     equivalent = photo.focal_35mm or ASSUMED_FOCAL_35MM
-    told = "by the photo's EXIF" if photo.focal_35mm else "assumed: the photo does not tell"
+    told = (
+        "from the photo's EXIF data" if photo.focal_35mm else "assumed: the photo does not state it"
+    )
     note = f"focal length {equivalent:.0f} mm (35 mm equivalent), {told}"
     return photo.focal_px(equivalent), note
 
@@ -88,11 +99,12 @@ def _focal(photo: Photo, px_per_mm: float, camera_mm: float | None) -> tuple[flo
 def _straight_down(
     photo: Photo, px_per_mm: float, focal: float, notes: list[str], hidden_px: Array | None
 ) -> GroundPlane:
-    """The plane seen from straight above; the photo's lower left corner is the origin."""
+    """Returns the plane as seen from straight above; the photo's lower left corner is the
+    origin."""
     width, height = photo.size
     homography = np.array([[px_per_mm, 0, -0.5], [0, -px_per_mm, height - 0.5], [0, 0, 1.0]])
     view = PlaneView(homography, focal, np.append(_center(photo, px_per_mm), focal / px_per_mm), 0)
-    notes = [*notes, "taken to be seen from straight above"]
+    notes = [*notes, "the photo is taken to be from straight above"]
     hidden = () if hidden_px is None else (view.to_plane(hidden_px),)
     high = np.array([width, height]) / px_per_mm
     return GroundPlane(view, photo.pixels, np.zeros(2), high, None, hidden, notes)
@@ -103,7 +115,7 @@ def _center(photo: Photo, px_per_mm: float) -> Array:
 
 
 def _find_disc(cv2: Any, photo: Photo) -> tuple[Array, float]:
-    """The centre and radius of the disc in the photo, in pixels."""
+    """Finds the centre (2,) and the radius of the disc in the photo, in pixels."""
     factor = min(1.0, _SMALL_SIDE / max(photo.size))
     small = cv2.resize(photo.pixels, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
     lab = cv2.cvtColor(cv2.GaussianBlur(small, (0, 0), 1.2), cv2.COLOR_RGB2LAB)
@@ -122,20 +134,21 @@ def _find_disc(cv2: Any, photo: Photo) -> tuple[Array, float]:
             distinct.append(disc)
     if not distinct:
         raise UserError(
-            f"{photo.path}: no disc is seen: lay the coin apart from the tools, on plain ground, "
-            "and take the photo from straight above"
+            f"{photo.path}: no disc is visible: lay the coin apart from the tools, on plain "
+            "ground, and take the photo from straight above"
         )
     if len(distinct) > 1:
         raise UserError(
-            f"{photo.path}: {len(distinct)} round things are seen: leave one disc only, or use "
-            "--scale_px"
+            f"{photo.path}: {len(distinct)} round objects are visible: leave one disc only, or "
+            "use --scale_px"
         )
     _, center, radius = distinct[0]
     return _refined_disc(cv2, photo, (center + 0.5) / factor - 0.5, radius / factor)
 
 
 def _disc_of(cv2: Any, contour: Any) -> tuple[float, Array, float] | None:
-    """(misfit, centre, radius) of a contour that is a circle."""
+    """Fits a circle to a contour; returns its (misfit, centre, radius), or None if it is no
+    circle."""
     area = cv2.contourArea(contour)
     if len(contour) < 40 or area < 400:
         return None
@@ -149,7 +162,7 @@ def _disc_of(cv2: Any, contour: Any) -> tuple[float, Array, float] | None:
 
 
 def _refined_disc(cv2: Any, photo: Photo, center: Array, radius: float) -> tuple[Array, float]:
-    """The circle through the steepest changes along rays."""
+    """Refines a circle: fits it to the steepest changes of lightness along rays from its centre."""
     gray = cv2.GaussianBlur(cv2.cvtColor(photo.pixels, cv2.COLOR_RGB2GRAY), (0, 0), 1.0)
     angles = np.linspace(0, 2 * np.pi, 360, endpoint=False)
     rays = np.c_[np.cos(angles), np.sin(angles)]
@@ -169,36 +182,40 @@ def _by_board(cv2: Any, photo: Photo, scale: Scale, camera_mm: float | None) -> 
     columns, rows, square, marker = scale.board
     dictionary = getattr(cv2.aruco, scale.dictionary.upper(), None)
     if dictionary is None:
-        raise UserError(f"--dictionary {scale.dictionary} is not one of OpenCV's, as DICT_4X4_50")
+        raise UserError(
+            f"--dictionary {scale.dictionary} is not a dictionary of OpenCV, such as DICT_4X4_50"
+        )
     try:
         board = cv2.aruco.CharucoBoard(
             (columns, rows), square, marker, cv2.aruco.getPredefinedDictionary(dictionary)
         )
     except (cv2.error, SystemError) as error:
         raise UserError(
-            f"--board: there is no board of {columns} x {rows} with these sizes"
+            f"--board: OpenCV cannot make a board of {columns} x {rows} squares with these sizes"
         ) from error
     gray = cv2.cvtColor(photo.pixels, cv2.COLOR_RGB2GRAY)
     corners, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(gray)
     if ids is None or len(ids) < _LEAST_CORNERS:
         seen = 0 if ids is None else len(ids)
         raise UserError(
-            f"{photo.path}: {seen} corners of the board are seen, fewer than {_LEAST_CORNERS}: "
-            "show all of it, and check --board and --dictionary"
+            f"{photo.path}: {seen} corners of the board are visible, fewer than {_LEAST_CORNERS}: "
+            "show the whole board, and check --board and --dictionary"
         )
     points = board.getChessboardCorners()[ids.ravel(), :2].astype(float)
-    # The board's frame has y down its rows.
+    # In the board's own frame, y points down along its rows.
     points[:, 1] = rows * square - points[:, 1]
     pixels = corners.reshape(-1, 2).astype(float)
     homography, _ = cv2.findHomography(points, pixels)
     if photo.focal_35mm:
         focal = photo.focal_px(photo.focal_35mm)
-        told = f"focal length {photo.focal_35mm:g} mm (35 mm equivalent), by the photo's EXIF"
+        told = (
+            f"focal length {photo.focal_35mm:g} mm (35 mm equivalent), from the photo's EXIF data"
+        )
     else:
         known = focal_of_homography(homography, photo.center)
         focal = known or photo.focal_px(ASSUMED_FOCAL_35MM)
         told = f"focal length {focal / photo.focal_px(1.0):.0f} mm (35 mm equivalent), " + (
-            "by the board's perspective" if known else "assumed: the photo does not tell"
+            "from the board's perspective" if known else "assumed: the photo does not state it"
         )
     if camera_mm is not None:
         focal = focal_of_height(homography, camera_mm, focal, photo.center)

@@ -11,12 +11,14 @@ Array = NDArray[np.float64]
 
 _SMALL_SIDE = 900
 _LEAST_SHARE = 0.04
-"""A sheet covers at least this share of the photo."""
+"""The least share of the photo's area that a sheet covers."""
 _SAMPLES = 400
 _LEAST_SUPPORT = 0.4
-"""At least this share of each edge must be seen."""
+"""The least share of each edge that must be visible."""
 _REACHES = ((0.012, 0.005), (0.05, 0.012, 0.005))
-"""How far from a rough edge to look, as shares of the photo: a tool may hide the true edge."""
+"""How far from a rough edge to search for the true one, as shares of the photo's longer side. Each
+row is one attempt, refined from left to right; the far search of the second row is for an edge that
+a tool hides."""
 _CLOSE_PX = 2.5
 _SAME_QUAD = 0.02
 
@@ -26,9 +28,9 @@ class SheetQuad:
     """The four edges of a sheet in a photo."""
 
     corners: Array
-    """(4, 2) in pixels, counter-clockwise as seen."""
+    """The corners (4, 2) in pixels, counter-clockwise in the picture."""
     support: Array
-    """(4,) the share of each edge that is seen."""
+    """The visible share (4,) of each edge."""
     edges: tuple[Array, ...]
     """Points (n, 2) on each edge, in pixels."""
     width_px: float
@@ -36,7 +38,7 @@ class SheetQuad:
 
 
 def find_quads(cv2: Any, pixels: Any) -> list[SheetQuad]:
-    """The quadrilaterals that may be a sheet, the largest first."""
+    """Finds the quadrilaterals in a photo that may be a sheet, the largest first."""
     scale = min(1.0, _SMALL_SIDE / max(pixels.shape[:2]))
     small = cv2.resize(pixels, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     rough: list[Array] = []
@@ -62,7 +64,7 @@ def _area(corners: Array) -> float:
 
 
 def _masks(cv2: Any, small: Any) -> Iterator[Any]:
-    """Regions that differ from their surroundings by lightness or colour."""
+    """Yields masks of regions that differ from their surroundings in lightness or colour."""
     lab = cv2.cvtColor(cv2.GaussianBlur(small, (0, 0), 1.5), cv2.COLOR_RGB2LAB)
     size = np.ones((5, 5), np.uint8)
     spread = np.abs(lab[..., 1:].astype(int) - 128).max(axis=2)
@@ -78,7 +80,7 @@ def _masks(cv2: Any, small: Any) -> Iterator[Any]:
 
 
 def _quads_of(cv2: Any, mask: Any) -> Iterator[Array]:
-    """Quadrilaterals around the connected regions of a mask."""
+    """Yields quadrilaterals (4, 2) around the connected regions of a mask."""
     contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     rows, columns = mask.shape
     for contour in contours:
@@ -104,13 +106,13 @@ def _quads_of(cv2: Any, mask: Any) -> Iterator[Array]:
 
 
 def _four_sides(cv2: Any, hull: Any) -> Array | None:
-    """The corners where the four longest sides of a convex hull meet."""
+    """Returns the corners (4, 2) where the four longest sides of a convex hull meet, or None."""
     length = cv2.arcLength(hull, True)
     polygon = cv2.approxPolyDP(hull, 0.008 * length, True)[:, 0].astype(float)
     if len(polygon) < 4:
         return None
     sides = np.roll(polygon, -1, axis=0) - polygon
-    # Sides that go on in the same direction are one.
+    # Merge successive sides that have nearly the same direction.
     longest = sorted(np.argsort(-np.linalg.norm(sides, axis=1))[:4].tolist())
     lines = [_line(polygon[i], polygon[i] + sides[i]) for i in longest]
     corners = [_crossing(lines[i - 1], lines[i]) for i in range(4)]
@@ -125,12 +127,12 @@ def _four_sides(cv2: Any, hull: Any) -> Array | None:
     margin = 0.2 * (high - low)
     if np.any(quad < low - margin) or np.any(quad > high + margin):
         return None
-    # Counter-clockwise as seen: rows point down.
+    # Order the corners counter-clockwise in the picture, where rows point down.
     return quad if turns[0] < 0 else quad[::-1]
 
 
 def _line(start: Array, end: Array) -> Array:
-    """(a, b, c) with a x + b y = c and a^2 + b^2 = 1."""
+    """Returns (a, b, c) of the line a x + b y = c through two points, with a^2 + b^2 = 1."""
     along = (end - start) / np.linalg.norm(end - start)
     normal = np.array([-along[1], along[0]])
     return np.array([*normal, normal @ start])
@@ -183,7 +185,20 @@ def _refined_as(
 def _edge(
     cv2: Any, gray: Any, start: Array, end: Array, reach: float, sign: int
 ) -> tuple[Array, float, Array, float] | None:
-    """A line through the steepest changes near a segment, its support, points and blur."""
+    """Fits a line to the steepest changes of lightness near a segment.
+
+    Args:
+        cv2: OpenCV.
+        gray: (rows, columns) the lightness.
+        start: (2,) the start of the segment in pixels.
+        end: (2,) its end.
+        reach: how far from the segment to search, in pixels.
+        sign: 1 or -1, the direction across the segment in which the lightness rises.
+
+    Returns:
+        The line (a, b, c), the share of the segment that supports it, the points (n, 2) on it, and
+        the width of the blur in pixels. None if there is no such line.
+    """
     along = end - start
     normal = np.array([-along[1], along[0]]) / np.linalg.norm(along)
     shares = np.linspace(0.03, 0.97, _SAMPLES)
@@ -216,7 +231,7 @@ def _edge(
 
 
 def _robust_line(shares: Array, offsets: Array) -> tuple[Array, Array]:
-    """(offset, slope) of the line that most points lie close to, and which these are."""
+    """Fits a line to most of the points; returns its (offset, slope) and a mask of these points."""
     rng = np.random.default_rng(0)
     design = np.c_[np.ones_like(shares), shares]
     first, second = rng.integers(0, len(shares), (2, 200))

@@ -1,4 +1,4 @@
-"""The plane of a photo by a sheet of paper of known size."""
+"""Finds the plane of a photo from a sheet of paper of known size."""
 
 import math
 from dataclasses import dataclass
@@ -24,33 +24,34 @@ Array = NDArray[np.float64]
 SHEETS = {"a4": (297.0, 210.0), "letter": (279.4, 215.9)}
 """Sizes of sheets, the longer side first, in mm."""
 _ASPECT_ERROR = 0.025
-"""The largest error of the sides' ratio of a sheet that is recognised."""
+"""The largest error of the ratio of a sheet's sides at which its format is recognised."""
 _GIVEN_ASPECT_ERROR = 0.06
 _FOCALS_35MM = (22.0, 24.0, 26.0, 28.0, 31.0)
-"""Focal lengths of phones, for photos that do not tell theirs."""
+"""Typical 35 mm equivalent focal lengths of phones, for photos without EXIF data on it."""
 _FOCAL_RANGE_35MM = (18.0, 90.0)
 _MARGIN_MM = 8.0
 _BOW_MM = 0.3
-"""A smaller bow of the sheet's edges is not corrected."""
+"""The bow of a sheet's edges, in mm, below which the lens distortion is not corrected."""
 
 
 @dataclass(frozen=True)
 class GroundPlane:
-    """The plane that the tools lie on."""
+    """The plane that the tools lie on, as seen in a photo."""
 
     view: PlaneView
     pixels: Any
-    """The photo without the lens's distortion."""
+    """The photo's pixels (rows, columns, 3), without the lens distortion."""
     low: Array
-    """(2,) corners of the part to look at, in mm."""
+    """The lower left corner (2,) of the part of the plane to trace, in mm; `high` is its upper
+    right corner."""
     high: Array
     sheet: Array | None
-    """(2,) the sheet's size; the sheet's lower left corner is the origin. None: no sheet."""
+    """The sides (2,) of the sheet in mm, if there is one; its lower left corner is the origin."""
     hidden: tuple[Array, ...]
-    """Polygons that hold no tools, in mm."""
+    """Polygons (n, 2) in mm in which no tools are searched."""
     notes: list[str]
     blur_mm: float = 0.0
-    """The width of the sheet's edges; 0 if not known."""
+    """The width of the blur of the sheet's edges in mm; 0 if unknown."""
 
 
 def plane_of_sheet(
@@ -60,17 +61,17 @@ def plane_of_sheet(
     corners: Array | None = None,
     camera_mm: float | None = None,
 ) -> GroundPlane:
-    """Finds the sheet and the camera above it.
+    """Finds the sheet in a photo, and the camera's position above it.
 
     Args:
         cv2: OpenCV.
         photo: the photo.
         size: the sheet's sides, in mm; None: A4 or Letter, by the ratio of the sides seen.
-        corners: (4, 2) the sheet's corners in pixels; None: to be found.
-        camera_mm: the camera's height above the sheet.
+        corners: (4, 2) the sheet's corners in pixels; None: they are searched.
+        camera_mm: the camera's height above the sheet, in mm; None: computed from the focal length.
 
     Raises:
-        UserError: no sheet is found, or its size can be read in two ways.
+        UserError: no sheet is found, or it may be either A4 or Letter.
     """
     if corners is None:
         quad, size = _choose(photo, find_quads(cv2, photo.pixels), size)
@@ -103,7 +104,8 @@ def plane_of_sheet(
 
 
 def _oriented(photo: Photo, corners: Array, size: tuple[float, float]) -> tuple[Array, Array]:
-    """The homography from the sheet's frame, and the sheet's sides along x and y."""
+    """Returns the homography from the sheet's frame to pixels, and the sheet's sides along x and
+    y."""
     right = [corners[(i + 1) % 4] - corners[i] for i in range(4)]
     start = int(np.argmax([side[0] / np.linalg.norm(side) for side in right]))
     corners = np.roll(corners, -start, axis=0)
@@ -117,11 +119,12 @@ def _oriented(photo: Photo, corners: Array, size: tuple[float, float]) -> tuple[
 def _choose(
     photo: Photo, quads: list[SheetQuad], size: tuple[float, float] | None
 ) -> tuple[SheetQuad, tuple[float, float]]:
-    """The largest quadrilateral that looks like a sheet, and the sheet's size."""
+    """Chooses the largest quadrilateral with the proportions of a sheet; returns it and the
+    size."""
     if not quads:
         raise UserError(
-            f"{photo.path}: no sheet of paper is seen: lay the tools on a whole A4 or Letter sheet "
-            "that stands out from the desk, or give its corners with --points"
+            f"{photo.path}: no sheet of paper is found: lay the tools on a whole A4 or Letter "
+            "sheet that stands out from the desk, or give its corners with --points"
         )
     allowed = _ASPECT_ERROR if size is None else _GIVEN_ASPECT_ERROR
     sizes = list(SHEETS.values()) if size is None else [size]
@@ -140,13 +143,14 @@ def _choose(
     ratio = max(ratio, 1 / ratio)
     wanted = "A4 (1.414) or Letter (1.294)" if size is None else f"{max(size) / min(size):.3f}"
     raise UserError(
-        f"{photo.path}: the largest sheet seen has sides as {ratio:.3f} to 1, not {wanted}: show "
+        f"{photo.path}: the largest sheet found has sides as {ratio:.3f} to 1, not {wanted}: show "
         "the whole sheet, flat, or give its size with --sheet LENGTH WIDTH"
     )
 
 
 def _aspect_error(photo: Photo, corners: Array, size: tuple[float, float]) -> float:
-    """The error of the logarithm of the sides' ratio, at best."""
+    """The smallest error of the logarithm of the ratio of a sheet's sides, over the possible focal
+    lengths."""
     focals = (photo.focal_35mm,) if photo.focal_35mm else _FOCALS_35MM
     wanted = math.log(max(size) / min(size))
     errors = []
@@ -157,13 +161,15 @@ def _aspect_error(photo: Photo, corners: Array, size: tuple[float, float]) -> fl
 
 
 def _focal(photo: Photo, homography: Array, camera_mm: float | None) -> tuple[float, str]:
-    """The focal length in pixels, and where it comes from."""
+    """Returns the focal length in pixels, and a note on its source."""
     if camera_mm is not None:
         start = photo.focal_px(ASSUMED_FOCAL_35MM)
         focal = focal_of_height(homography, camera_mm, start, photo.center)
         return focal, f"the camera {camera_mm:g} mm above the sheet, as given"
     if photo.focal_35mm:
-        text = f"focal length {photo.focal_35mm:g} mm (35 mm equivalent), by the photo's EXIF"
+        text = (
+            f"focal length {photo.focal_35mm:g} mm (35 mm equivalent), from the photo's EXIF data"
+        )
         if photo.cropped:
             text += ", though the photo was cropped"
         return photo.focal_px(photo.focal_35mm), text
@@ -171,28 +177,33 @@ def _focal(photo: Photo, homography: Array, camera_mm: float | None) -> tuple[fl
     equivalent = focal_px / photo.focal_px(1.0) if focal_px else 0.0
     if focal_px and _FOCAL_RANGE_35MM[0] < equivalent < _FOCAL_RANGE_35MM[1]:
         return focal_px, (
-            f"focal length {equivalent:.0f} mm (35 mm equivalent), by the sheet's perspective"
+            f"focal length {equivalent:.0f} mm (35 mm equivalent), from the sheet's perspective"
         )
     return photo.focal_px(ASSUMED_FOCAL_35MM), (
         f"focal length {ASSUMED_FOCAL_35MM:g} mm (35 mm equivalent) assumed: the photo does not "
-        "tell"
+        "state it"
     )
 
 
 def _lens_of_edges(
     cv2: Any, quad: SheetQuad, sides: Array, focal: float, photo: Photo
 ) -> tuple[float, str]:
-    """k1 of the lens that makes the sheet's edges straight, or 0; and a note, or ""."""
+    """Finds the lens distortion that makes the sheet's edges straight.
+
+    Returns:
+        The coefficient k1 of the distortion, 0 if none is needed; and a note for the user, which
+        may be empty.
+    """
     mm_per_px = float(sides.sum() * 2) / sum(
         float(np.linalg.norm(quad.corners[i] - quad.corners[i - 1])) for i in range(4)
     )
 
     def bows(k1: float) -> Array:
-        """The rise of each edge over its chord, in mm."""
+        """The rise of each edge over its chord, in mm, after correction with k1."""
         result = []
         for points in quad.edges:
             p = (points - photo.center) / focal
-            # The inverse of the distortion, to first order and once refined.
+            # Invert the distortion to first order, and refine the result once.
             r = (p**2).sum(axis=1, keepdims=True)
             q = p / (1 + k1 * r)
             q = p / (1 + k1 * (q**2).sum(axis=1, keepdims=True))

@@ -1,4 +1,4 @@
-"""The silhouettes of tools on a rectified photo, in mm."""
+"""Finds the silhouettes of tools on a rectified photo, in mm."""
 
 from typing import Any
 
@@ -15,7 +15,8 @@ from kitting_drake.hkd.tracing.tool_mask import tool_mask
 Array = NDArray[Any]
 
 _RIM_MM = 1.2
-"""The rim of a sheet, where its edge casts a shadow, is not looked at."""
+"""The width of the rim of a sheet that is ignored, because the sheet's edge casts a shadow there,
+in mm."""
 _LEAST_LOOP_MM2 = 4.0
 _LEAST_TOOL_MM2 = 60.0
 _FLAT_MM = 0.03
@@ -27,17 +28,20 @@ def find_silhouettes(
     sheet: Array | None,
     hidden: tuple[Array, ...],
 ) -> tuple[CrossSection, float]:
-    """The area that tools cover, and the width of its border's blur, in mm.
+    """Finds the area that tools cover.
 
     Args:
         cv2: OpenCV.
-        photo: the plane from above.
-        sheet: (2,) the size of the sheet, whose lower left corner is the origin; tools lie on it.
-            None: all of the photo is ground.
+        photo: the plane as seen from straight above.
+        sheet: (2,) the size of the sheet, whose lower left corner is the origin. The tools lie on
+            it. None: the whole photo is ground.
         hidden: polygons to leave out.
 
+    Returns:
+        The area in mm, and the width of the blur of its border in mm.
+
     Raises:
-        UserError: a tool reaches over the sheet's edge.
+        UserError: a tool extends beyond the sheet's edge.
     """
     ppm = photo.px_per_mm
     logs = log_light(photo.pixels)
@@ -52,8 +56,8 @@ def find_silhouettes(
         inner = _polygon(cv2, photo, _rectangle(_RIM_MM + 0.5, sheet - _RIM_MM - 0.5))
         if mask[~inner].any():
             raise UserError(
-                "a tool reaches over the sheet's edge: lay it wholly on the sheet, or use a "
-                "larger one (--sheet LENGTH WIDTH)"
+                "a tool reaches over the sheet's edge: move it onto the sheet, or use a larger "
+                "sheet (--sheet LENGTH WIDTH)"
             )
     if not mask.any():
         return CrossSection(), 0.0
@@ -74,7 +78,7 @@ def _polygon(cv2: Any, photo: RectifiedPhoto, polygon: Array) -> Array:
 
 
 def _cleaned(area: CrossSection) -> CrossSection:
-    """Without specks and tiny holes."""
+    """Removes specks and tiny holes from an area."""
     result = CrossSection()
     for part in area.decompose():
         loops = [np.asarray(loop) for loop in part.to_polygons()]
@@ -95,17 +99,20 @@ def _blur_mm(cv2: Any, soft: Array, mask: Array, ppm: float) -> float:
 
 
 _BAND_MM = 0.7
-"""The outline is within this distance of the mask's edge."""
+"""The largest distance of the true outline from the edge of the mask, in mm."""
 _SKIP_MM = 0.35
 _NEAR_MM = 0.8
 _LEAST_CONTRAST = 0.03
 
 
 def soft_mask(cv2: Any, photo: RectifiedPhoto, mask: Array) -> Array:
-    """(rows, columns) the share of a tool's light in each pixel near the edge of a mask.
+    """Estimates how much of each pixel near the edge of a mask a tool covers.
 
-    The tool's and the ground's colours are those a little inside and outside of the edge, so a
-    shadow beside a tool counts as ground.
+    The colours of the tool and of the ground are taken a little inside and outside of the edge, so
+    a shadow beside a tool counts as ground.
+
+    Returns:
+        The covered share (rows, columns), from 0 to 1.
     """
     ppm = photo.px_per_mm
     u, v, width, height = cv2.boundingRect(mask)
@@ -120,7 +127,7 @@ def soft_mask(cv2: Any, photo: RectifiedPhoto, mask: Array) -> Array:
 
 
 def _soft(cv2: Any, light: Array, mask: Array, ppm: float) -> Array:
-    # Blur is at least a pixel or two wide.
+    # The blur is at least one or two pixels wide.
     skip = max(_SKIP_MM, 1.5 / ppm)
     inside = cv2.distanceTransform(mask, cv2.DIST_L2, 5) / ppm
     outside = cv2.distanceTransform(1 - mask, cv2.DIST_L2, 5) / ppm
@@ -142,12 +149,16 @@ def _soft(cv2: Any, light: Array, mask: Array, ppm: float) -> Array:
 
 
 def _spread_colour(cv2: Any, light: Array, where: Array, ppm: float) -> Array:
-    """(rows, columns, 4) the mean colour of the nearby pixels `where`, and their weight."""
+    """Averages the colour of the nearby pixels that are in a mask.
+
+    Returns:
+        The mean colour and the weight of each pixel (rows, columns, 4).
+    """
     stacked = np.empty((*where.shape, 4), np.float32)
     stacked[..., :3] = light
     stacked[..., 3] = 1
     stacked[~where] = 0
-    # Three box filters are close to a Gaussian, and faster.
+    # Three box filters approximate a Gaussian, and are faster.
     side = 2 * round(0.85 * _NEAR_MM * ppm) + 1
     for _ in range(3):
         stacked = cv2.blur(stacked, (side, side))
@@ -156,8 +167,8 @@ def _spread_colour(cv2: Any, light: Array, where: Array, ppm: float) -> Array:
 
 
 def contours(photo: RectifiedPhoto, soft: Array) -> CrossSection:
-    """The area, in mm, where a soft mask is over one half."""
-    # Import lazily: it comes with matplotlib.
+    """Returns the area in mm in which a soft mask (rows, columns) exceeds one half."""
+    # Import matplotlib lazily.
     import contourpy
 
     padded = np.pad(soft, 1)

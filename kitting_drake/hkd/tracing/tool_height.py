@@ -1,4 +1,4 @@
-"""Corrects a silhouette for the tool's height above the plane that it lies on."""
+"""Corrects a silhouette for the tool's height above the plane on which it lies."""
 
 import math
 
@@ -15,17 +15,19 @@ _STEP_MM = 0.4
 def outline_of_silhouette(
     silhouette: CrossSection, camera: NDArray[np.float64], height: float, edges: str
 ) -> CrossSection:
-    """The outline of a tool whose silhouette a camera casts on the plane, in mm.
+    """Computes a tool's outline from its silhouette, both in mm in the plane's frame.
 
-    A point at height h is seen H / (H - h) times as far from the point below the camera. Upright
-    sides are seen from top to bottom: at their top where they face away from that point, and at
-    their foot where they face it. So the outline is what the silhouette holds at every factor
-    from 1 to H / (H - t). The edge of a round tool is at half its height t on all sides.
+    Let the camera be at height H above the plane, and the tool t high. A point at height h appears
+    H / (H - h) times as far from the point below the camera. Of an upright side, the camera sees
+    the top where the side faces away from the point below the camera, and the foot where it faces
+    that point. So the outline is the part of the plane that the silhouette covers at every scale
+    from 1 to H / (H - t). The widest points of a round tool are at height t / 2 on all sides, so
+    its silhouette is scaled once.
 
     Args:
-        silhouette: in the plane's frame.
+        silhouette: the area that the tool hides in the plane.
         camera: (3,) the camera's position.
-        height: t, below the camera's height H.
+        height: the tool's height t in mm, less than H.
         edges: one of `EDGES`.
     """
     below = (float(camera[0]), float(camera[1]))

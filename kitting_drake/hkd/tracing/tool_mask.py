@@ -9,26 +9,28 @@ from numpy.typing import NDArray
 Array = NDArray[Any]
 
 _DARKER, _BRIGHTER, _COLOURED = 0.22, 0.12, 0.11
-"""Differences from the ground, in logarithms of light, that may be a tool."""
+"""The least differences from the ground that may be a tool, in logarithms of light: darker,
+brighter, or differently coloured."""
 _NO_SHADOW = 1.3
-"""A shadow is not darker than this."""
+"""The largest darkening by a shadow, in logarithms of light."""
 _STEEP = 0.45
-"""A step of the logarithm of light, per mm, that is steeper than the edge of a shadow."""
+"""The slope at which an edge is too steep to be a shadow's, in logarithms of light per mm."""
 _BALL_MM = 0.9
-"""The ground reaches only where a disc of this radius can roll."""
+"""The radius of the disc that must fit wherever the ground is found, in mm."""
 _ROUGH = 0.022
-"""The least roughness of a tool's skin, in logarithms of light."""
+"""The least roughness of a tool's surface, in logarithms of light."""
 _MOST_FINE = 0.1
 _HOLE_BALL_MM = 0.6
 _STRIP_MM = 1.2
 _EDGE_MM = 2.3
 _SHINE_STEEP = 0.6
-"""The edge of shine is less steep."""
+"""The largest slope of the edge of a specular reflection, in logarithms of light per mm."""
 _BAY_MM = 8.0
-"""A bright band across a tool, with soft edges, is shine if it is narrower than twice this."""
+"""Half the width, in mm, below which a bright band with soft edges across a tool is a
+reflection."""
 _NEUTRAL = 0.05
 _LARGEST_HOLE_MM2 = 500.0
-"""A larger hole shows ground out of the shadow."""
+"""The area in mm^2 above which a hole must show ground that is not in shadow."""
 _UNLIKE_SHARE = 0.3
 _LEAST_AREA_MM2 = 40.0
 _LEAST_HOLE_MM2 = 4.0
@@ -36,17 +38,21 @@ _LEAST_HOLE_RADIUS_MM = 0.7
 
 
 def tool_mask(cv2: Any, ratio: Array, ground: Array, spread: float, px_per_mm: float) -> Array:
-    """(rows, columns) 1 where a tool hides the ground.
+    """Separates tools from the ground and from shadows.
 
-    Pixels that look like the ground are ground. So are shadows: neutral pixels that are reached
-    from there over soft steps. The rest is a tool. A watershed puts its border at the steepest step
-    between the two.
+    Pixels that look like the ground are ground. Shadows are ground too: they are neutral in colour,
+    and connected to the ground without a steep step. The rest is a tool. Finally a watershed moves
+    the border to the steepest step between the two.
 
     Args:
         cv2: OpenCV.
-        ratio, spread: from `ground_light.flattened`.
-        ground: (rows, columns) where tools may be.
+        ratio: (rows, columns, 3) the logarithms from `ground_light.flattened`.
+        ground: (rows, columns) true where tools may be.
+        spread: the standard deviation from `ground_light.flattened`.
         px_per_mm: the resolution.
+
+    Returns:
+        A mask (rows, columns): 1 where a tool hides the ground.
     """
     smooth = cv2.GaussianBlur(ratio, (0, 0), 0.12 * px_per_mm + 0.3)
     lightness, colour = _lightness_and_colour(cv2, smooth)
@@ -64,12 +70,14 @@ def tool_mask(cv2: Any, ratio: Array, ground: Array, spread: float, px_per_mm: f
     usual = _median(rough[plain & ground], _ROUGH)
     even = (free & (rough < max(_ROUGH, 3 * usual))) | ~ground
     reached = _reached(cv2, even, plain, px_per_mm)
-    # A hole may be in the shadow. Its edge is close: a median keeps edges apart from roughness.
+    # A hole may lie wholly in shadow, close to edges. A median filter does not take these edges for
+    # roughness.
     finely = _roughness(cv2, light, cv2.medianBlur(light, 5), px_per_mm)
     limit = 1.7 * _median(finely[plain & ground], _ROUGH) * np.exp(-lightness / 2)
     like_ground = (colour < _NEUTRAL * noise) & (finely < limit)
     reached |= _shaded_holes(cv2, free & (finely < 2 * limit) & ~reached, like_ground, px_per_mm)
-    # The edge of a tool is rough on both sides of it: go on over what is not steep.
+    # The edge of a tool is rough on both sides. So extend the ground over rough pixels, up to a
+    # steep step.
     for _ in range(math.ceil(_EDGE_MM * px_per_mm)):
         reached |= (cv2.dilate(reached.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0) & free
     tool = _components(cv2, (~reached).astype(np.uint8), evidence, px_per_mm)
@@ -81,7 +89,8 @@ def tool_mask(cv2: Any, ratio: Array, ground: Array, spread: float, px_per_mm: f
     image = ((np.clip(-smooth, -0.3, 2.25) + 0.3) * 100).astype(np.uint8)
     cv2.watershed(np.ascontiguousarray(image), markers)
     mask = (markers == 2).astype(np.uint8)
-    # The lines of the watershed belong to neither side.
+    # The watershed's lines belong to neither side; assign each to the side with more of its
+    # neighbours.
     mask[(markers == -1) & (cv2.blur(mask.astype(np.float32), (3, 3)) > 0.4)] = 1
     return _cleaned(cv2, mask, evidence, px_per_mm)
 
@@ -91,7 +100,7 @@ def _median(values: Array, otherwise: float) -> float:
 
 
 def _lightness_and_colour(cv2: Any, logs: Array) -> tuple[Array, Array]:
-    """The mean of the three logarithms, and the largest difference from it."""
+    """Returns the mean of the three logarithms, and the largest deviation of one from the mean."""
     lightness = cv2.transform(logs, np.full((1, 3), 1 / 3, np.float32))
     colour = np.zeros_like(lightness)
     for k in range(3):
@@ -100,7 +109,7 @@ def _lightness_and_colour(cv2: Any, logs: Array) -> tuple[Array, Array]:
 
 
 def _steepness(cv2: Any, smooth: Array, px_per_mm: float) -> Array:
-    """The largest slope of any colour, per mm."""
+    """Returns the largest slope (rows, columns) of any colour, per mm."""
     steep = np.zeros(smooth.shape[:2], np.float32)
     for k in range(3):
         x = cv2.Sobel(smooth[..., k], cv2.CV_32F, 1, 0, scale=px_per_mm / 8)
@@ -110,13 +119,14 @@ def _steepness(cv2: Any, smooth: Array, px_per_mm: float) -> Array:
 
 
 def _roughness(cv2: Any, light: Array, even: Array, px_per_mm: float) -> Array:
-    """The fine differences from an evened picture; in a shadow they are those of the ground."""
+    """Returns the local root mean square (rows, columns) of the differences from a smoothed
+    picture."""
     fine = np.clip(light - even, -_MOST_FINE, _MOST_FINE)
     return np.sqrt(cv2.GaussianBlur(fine * fine, (0, 0), 0.5 * px_per_mm))
 
 
 def _reached(cv2: Any, even: Array, plain: Array, px_per_mm: float) -> Array:
-    """The pixels under a disc that rolls over `even` pixels from plain ground."""
+    """Finds the pixels that a disc can cover as it rolls over `even` pixels from plain ground."""
     disc = _disc(cv2, _BALL_MM * px_per_mm)
     room = cv2.erode(even.astype(np.uint8), disc)
     count, labels = cv2.connectedComponents(room, connectivity=4)
@@ -127,7 +137,7 @@ def _reached(cv2: Any, even: Array, plain: Array, px_per_mm: float) -> Array:
 
 
 def _shaded_holes(cv2: Any, even: Array, like_ground: Array, px_per_mm: float) -> Array:
-    """Even regions that look like ground in the shadow: holes, and strips beside a tool."""
+    """Finds even regions that look like ground in shadow: holes, and strips beside a tool."""
     disc = _disc(cv2, _HOLE_BALL_MM * px_per_mm)
     room = cv2.erode(even.astype(np.uint8), disc)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(room, connectivity=4)
@@ -142,9 +152,9 @@ def _shaded_holes(cv2: Any, even: Array, like_ground: Array, px_per_mm: float) -
 
 
 def _without_shine(cv2: Any, tool: Array, steep: Array, px_per_mm: float) -> Array:
-    """Fills bays and holes whose border with the tool is soft: the tool shines there."""
+    """Fills bays and holes of a tool whose border is soft, because they are reflections."""
     rows, columns = tool.shape
-    # A large disc is slow at the full resolution.
+    # Work at a lower resolution, because a large disc is slow at the full one.
     factor = max(1, int(px_per_mm / 1.5))
     margin = math.ceil(_BAY_MM * px_per_mm / factor) + 2
     small = cv2.resize(tool, None, fx=1 / factor, fy=1 / factor, interpolation=cv2.INTER_AREA)
@@ -177,7 +187,7 @@ def _disc(cv2: Any, radius: float) -> Any:
 
 
 def _components(cv2: Any, mask: Array, evidence: Array, px_per_mm: float) -> Array:
-    """The connected regions that are large enough to be a tool, and unlike the ground."""
+    """Keeps the connected regions that are as large as a tool and differ from the ground."""
     mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, _disc(cv2, 0.2 * px_per_mm))
     _, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
     large = stats[:, cv2.CC_STAT_AREA] >= _LEAST_AREA_MM2 * px_per_mm**2
@@ -188,7 +198,7 @@ def _components(cv2: Any, mask: Array, evidence: Array, px_per_mm: float) -> Arr
 
 
 def _cleaned(cv2: Any, mask: Array, evidence: Array, px_per_mm: float) -> Array:
-    """Without specks, and with only such holes as show the ground."""
+    """Removes specks, and fills the holes that do not show the ground."""
     mask = _components(cv2, mask, evidence, px_per_mm)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(1 - mask, connectivity=4)
     for i in range(1, count):

@@ -1,6 +1,6 @@
-"""The files of a trace: outlines as SVG and DXF in true millimetres, and a picture.
+"""Writes the files of a trace: outlines as SVG and DXF in millimetres, and a picture.
 
-The picture has the photo from above, silhouettes, outlines, rulers and a scale bar.
+The picture shows the photo from above, silhouettes, outlines, rulers and a scale bar.
 """
 
 from typing import Any
@@ -20,7 +20,8 @@ def _loops(outline: CrossSection) -> list[NDArray[np.float64]]:
 
 
 def outlines_svg(outlines: dict[str, CrossSection]) -> str:
-    """An SVG with 1 mm user units and one path for each outline, holes included."""
+    """Draws outlines in mm as an SVG in units of 1 mm, with one path for each outline and its
+    holes."""
     bounds = np.array([outline.bounds() for outline in outlines.values()])
     low, high = bounds[:, :2].min(axis=0) - _MARGIN_MM, bounds[:, 2:].max(axis=0) + _MARGIN_MM
     width, height = high - low
@@ -43,7 +44,8 @@ def outlines_svg(outlines: dict[str, CrossSection]) -> str:
 
 
 def outlines_dxf(outlines: dict[str, CrossSection]) -> str:
-    """A DXF of release 2010 in mm, with closed polylines on one layer for each outline.
+    """Draws outlines as a DXF of release 2010 in mm, with closed polylines on one layer per
+    outline.
 
     Raises:
         MachineError: ezdxf is not installed.
@@ -68,7 +70,10 @@ def trace_png(
     outlines: dict[str, CrossSection],
     caption: str,
 ) -> bytes:
-    """A PNG; the rulers along its sides give the places for `--points`, in mm."""
+    """Draws the picture of a trace as a PNG.
+
+    The rulers along its sides show the coordinates in mm that the file of `--points` uses.
+    """
     scale = _LONG_SIDE / max(photo.shape)
     resized = cv2.resize(photo.pixels, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     image = cv2.copyMakeBorder(

@@ -1,9 +1,10 @@
-"""`hkd trace`: outlines of tools from a photo, as drawings in mm and as tools.
+"""Traces the outlines of tools in a photo, as drawings in mm and as tools (`hkd trace`).
 
-The plane that the tools lie on is found by something of known size (`sheet_plane`, `scales`), and
-the photo is rectified (`plane_view`). Tools are told from the ground and from shadows
-(`tool_mask`), their border is found to a fraction of a pixel (`silhouettes`), and the silhouette
-is corrected for the tool's height (`tool_height`).
+1. An object of known size gives the plane that the tools lie on (`sheet_plane`, `scales`).
+2. The photo is rectified (`plane_view`).
+3. Tools are separated from the ground and from shadows (`tool_mask`).
+4. Their border is found to a fraction of a pixel (`silhouettes`).
+5. The silhouette is corrected for the tool's height (`tool_height`).
 """
 
 import math
@@ -31,7 +32,7 @@ _STEEPEST = math.radians(30)
 _MOST_PX_PER_MM = 5.0
 _MOST_PIXELS = 4e6
 _BLURRED_MM = 1.6
-"""The edges of tools and sheet in a sharp photo are narrower."""
+"""The width of edges, in mm, above which a photo counts as blurred."""
 _HEIGHTS_MM = (0.5, 100.0)
 _CAMERAS_MM = (100.0, 3000.0)
 _SHARE_OF_HEIGHT = 0.5
@@ -44,39 +45,40 @@ class TraceRequest:
     photo: Path
     output: Path
     sheet_mm: tuple[float, float] | None = None
-    """The sheet's sides; None: A4 or Letter, whichever it looks like."""
+    """The sheet's sides. None: A4 or Letter, whichever the sheet looks like."""
     scale: Scale | None = None
-    """Something of known size other than a sheet."""
+    """An object of known size that is used instead of a sheet."""
     heights_mm: tuple[float, ...] = ()
-    """The tools' heights, from left to right, or one for all; empty: not corrected."""
+    """The tools' heights, from left to right, or one for all. Empty: no correction."""
     edges: str = "upright"
     """One of `tool_height.EDGES`."""
     camera_mm: float | None = None
-    """The camera's height above the plane; None: by the focal length."""
+    """The camera's height above the plane. None: computed from the focal length."""
     points: Path | None = None
-    """A file of corrections."""
+    """A file of corrections; see `corrections`."""
     name: str | None = None
-    """Of the outlines; by default the photo's."""
+    """The name of the outlines. None: the photo's name."""
 
 
 @dataclass(frozen=True)
 class TracedTool:
-    """One outline."""
+    """One traced outline."""
 
     name: str
     outline: CrossSection
-    """In mm, in the plane's frame."""
+    """The outline in mm, in the plane's frame."""
     height_mm: float | None
     svg: Path
 
     @property
     def holes(self) -> int:
-        """The number of its holes."""
+        """The number of the outline's holes."""
         return self.outline.num_contour() - 1
 
     @property
     def size_mm(self) -> tuple[float, float]:
-        """Length and width of the smallest rectangle around it, by whole degrees."""
+        """The length and width of the smallest rectangle around the outline, searched in steps of 1
+        degree."""
         sizes = []
         for angle in range(180):
             x_low, y_low, x_high, y_high = self.outline.rotate(angle).bounds()
@@ -131,7 +133,7 @@ def trace(request: TraceRequest) -> TraceReport:
 def _checked(request: TraceRequest) -> str:
     name = request.name or re.sub(r"[^a-z0-9]+", "_", request.photo.stem.lower()).strip("_")[:50]
     if not re.fullmatch(r"[a-z0-9][a-z0-9_]{0,60}", name):
-        raise UserError("--name must be small letters, digits and underscores")
+        raise UserError("--name must consist of lower-case letters, digits and underscores")
     for flag, values, (low, high) in (
         ("--height_mm", request.heights_mm, _HEIGHTS_MM),
         ("--camera_mm", (request.camera_mm,) if request.camera_mm else (), _CAMERAS_MM),
@@ -139,7 +141,7 @@ def _checked(request: TraceRequest) -> str:
     ):
         for value in values:
             if not low <= value <= high:
-                raise UserError(f"{flag} {value:g} is out of range: give {low:g} to {high:g}")
+                raise UserError(f"{flag} is {value:g}, out of range: give {low:g} to {high:g}")
     return name
 
 
@@ -153,7 +155,8 @@ def _check_view(photo: Photo, plane: GroundPlane) -> None:
 
 
 def _look(cv2: Any, photo: Photo, plane: GroundPlane) -> tuple[RectifiedPhoto, CrossSection, float]:
-    """The photo from above, the tools' silhouettes and their blur in mm."""
+    """Returns the photo as seen from above, the tools' silhouettes, and the width of their blur in
+    mm."""
     seen = _rectified(cv2, plane)
     try:
         return (seen, *find_silhouettes(cv2, seen, plane.sheet, plane.hidden))
@@ -178,13 +181,13 @@ def _check_parts(
 ) -> None:
     if not parts:
         raise UserError(
-            f"{photo.path}: no tool is seen: it must differ from what it lies on, or be added with "
-            "--points"
+            f"{photo.path}: no tool is seen: use a ground of another colour, or add the tool "
+            "with --points"
         )
     if blur > _BLURRED_MM:
         raise UserError(
-            f"{photo.path} is blurred: its edges are {blur:.1f} mm wide; take it again, "
-            "with more light or a steadier hand"
+            f"{photo.path} is blurred: edges are {blur:.1f} mm wide; take it again, with more "
+            "light or a steadier hand"
         )
     for part in parts:
         for loop in part.to_polygons():
@@ -193,8 +196,8 @@ def _check_parts(
             u, v = np.clip(u, 2, columns - 3), np.clip(v, 2, rows - 3)
             if not all(seen.seen[v + dv, u + du].all() for du in (-2, 2) for dv in (-2, 2)):
                 raise UserError(
-                    f"{photo.path}: a tool touches the photo's edge: show all of it, and some "
-                    "ground around it"
+                    f"{photo.path}: a tool touches the photo's edge: show the whole tool, and "
+                    "some ground around it"
                 )
 
 
@@ -207,7 +210,7 @@ def _heights(request: TraceRequest, count: int) -> list[float | None]:
     if len(given) != count:
         raise UserError(
             f"--height_mm has {len(given)} heights, and {request.photo} shows {count} tools: give "
-            "one for each, from left to right, or one for all"
+            "one height for each tool, from left to right, or one for all"
         )
     return [*given]
 
@@ -218,15 +221,16 @@ def _corrected(
     camera = plane.view.camera
     if height > _SHARE_OF_HEIGHT * camera[2]:
         raise UserError(
-            f"{photo.path}: the camera is {camera[2]:.0f} mm above the tool's ground, too close "
-            f"for a height of {height:g} mm"
+            f"{photo.path}: the camera is only {camera[2]:.0f} mm above the ground, which is too "
+            f"close for a tool {height:g} mm high"
         )
     outline = outline_of_silhouette(part, camera, height, edges)
     parts = sorted(outline.decompose(), key=lambda piece: -piece.area())
     if not parts or parts[0].area() < 0.5 * part.area():
         raise UserError(
-            f"{photo.path}: a tool {height:g} mm high would be thinner than its sides look: give "
-            "its true height, or take the photo from straight above"
+            f"{photo.path}: nothing would be left of a tool {height:g} mm high after the "
+            "correction for its sides: give its true height, or take the photo from straight "
+            "above"
         )
     return parts[0]
 

@@ -1,1 +1,1 @@
-"""Reads meshes and drawings as their many programs write them."""
+"""Readers of meshes and drawings, which tolerate the deviations of many programs."""

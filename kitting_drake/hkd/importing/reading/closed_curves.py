@@ -20,27 +20,27 @@ PAPERS_MM = (
     ("Legal", 215.9, 355.6),
     ("Tabloid", 279.4, 431.8),
 )
-"""Names and sides of sheets of paper."""
+"""Names of sheets of paper, and their sides in mm."""
 
 _JOIN_MM = 0.1
-"""The largest gap between ends of curves that are joined."""
+"""The largest gap between the ends of two curves that are joined, in mm."""
 _SAME_MM = 0.05
-"""Curves within this of another are the same, drawn twice."""
+"""The distance in mm within which a curve counts as a second drawing of another."""
 _LEAST_AREA_MM2 = 1.0
 _LINE_MM = 1.5
-"""Two outlines that are nowhere further apart are the two sides of one thick line."""
-# A rectangle is a page or frame if it has at least the first share of the page's sides, and the
-# next largest curve at least the second share of its length.
+"""The width in mm below which two outlines count as the two sides of one thick line."""
+# A rectangle counts as a page or frame if its sides are at least the first number times the page's,
+# and the next largest curve is at least the second number times as long as the rectangle.
 _PAGE, _SPANS = 0.85, 0.4
 
 Points = NDArray[np.float64]
 
 
 def enclosed(drawn: DrawnCurves, path: Path) -> tuple[CrossSection, list[str]]:
-    """The area inside the largest closed curve and outside the others, and notes.
+    """Returns the area inside the largest closed curve and outside the others, and notes.
 
     Raises:
-        UserError: a curve is open, or crosses itself, or is not inside the largest one.
+        UserError: a curve is open, crosses itself, or is not inside the largest curve.
     """
     notes: list[str] = []
     areas = [CrossSection([loop], FillRule.EvenOdd) for loop in _joined(drawn, path, notes)]
@@ -60,22 +60,22 @@ def enclosed(drawn: DrawnCurves, path: Path) -> tuple[CrossSection, list[str]]:
             )
     inner = outer.offset(-_LINE_MM, JoinType.Round)
     for hole in holes:
-        # The same curve drawn twice, as fill and stroke, is not a hole.
+        # If the same curve is drawn as a fill and as a line, the second is not a hole.
         if hole.area() >= 0.999 * areas[0].area():
             continue
         if (inner - hole).area() < 0.001 * inner.area():
-            notes.append("its outline is a thick line, whose outer side counts")
+            notes.append("its outline is a thick line; the outer side of the line is used")
             continue
         outer -= hole
     return outer.simplify(FLAT_MM), notes
 
 
 def _as_frame(areas: list[CrossSection], page_mm: tuple[float, float] | None) -> str | None:
-    """Describes the largest area if it is a page or a frame; None if it is the tool itself.
+    """Describes the largest area if it is a page or a frame; returns None if it is the tool itself.
 
     Args:
-        areas: inside closed curves, the largest first; at least two.
-        page_mm: the size of the page, where the drawing has one.
+        areas: the areas inside closed curves, the largest first; at least two.
+        page_mm: the size of the page, if the drawing has one.
     """
     area, inside, *others = areas
     x_min, y_min, x_max, y_max = area.bounds()
@@ -91,7 +91,7 @@ def _as_frame(areas: list[CrossSection], page_mm: tuple[float, float] | None) ->
     for name, short, long in PAPERS_MM:
         if np.abs(np.sort(sides) - (short, long)).max() < 1.0:
             return f"{size}, a sheet of {name},"
-    # A hole has no hole of its own, but the tool in a frame may have one.
+    # A hole contains no other hole, but the tool in a frame may have one.
     edge = (area.offset(-_LINE_MM, JoinType.Miter) - inside).area() < 0.001 * area.area()
     holed = any(
         other.area() < 0.98 * inside.area() and (other - inside).area() < 0.01 * other.area()
@@ -137,17 +137,17 @@ def _joined(drawn: DrawnCurves, path: Path, notes: list[str]) -> list[Points]:
 
 
 def _gap_error(chains: list[Points], drawn: DrawnCurves, path: Path) -> UserError:
-    """The error of open curves, with the smallest gap between their ends and its place."""
+    """Returns the error for open curves, with the smallest gap between their ends and its place."""
     ends = np.array([end for chain in chains for end in (chain[0], chain[-1])])
     gaps = np.linalg.norm(ends[:, None] - ends, axis=2)
     gaps[gaps <= _JOIN_MM] = np.inf
     one, other = np.unravel_index(int(np.argmin(gaps)), gaps.shape)
     x, y = (ends[one] + ends[other]) / 2
-    # SVG has y down, from the page's upper edge.
+    # In SVG y points down, from the page's upper edge.
     place = f"x = {x:.1f}, y = {y if drawn.page_mm is None else -y:.1f} mm"
     return UserError(
-        f"{path} has an open curve with a gap of {gaps[one, other]:.2f} mm at {place}: close it, "
-        "or delete what does not belong to the outline"
+        f"{path} has an open curve with a gap of {gaps[one, other]:.2f} mm at {place}: close the "
+        "curve, or delete it if it does not belong to the outline"
     )
 
 
@@ -169,7 +169,7 @@ def _merged_lines(curves: list[Curve]) -> list[Curve]:
             places = np.sort(offsets @ along, axis=1)
             overlap = np.minimum(places[:, 1], length) - np.maximum(places[:, 0], 0.0)
             shorter = np.minimum(places[:, 1] - places[:, 0], length)
-            # Short pieces of a curve are neighbours, not doubles.
+            # Do not merge short pieces of a curve, because they are neighbours.
             slack = np.minimum(_SAME_MM, 0.2 * shorter)
             beside = np.abs(offsets @ np.array([-along[1], along[0]])).max(axis=1)
             least = np.minimum(2 * _JOIN_MM, 0.5 * shorter)
@@ -185,7 +185,7 @@ def _merged_lines(curves: list[Curve]) -> list[Curve]:
 
 
 def _without_doubles(curves: list[Points]) -> list[int]:
-    """The indices, in order, of the curves that do not lie on a longer or earlier one."""
+    """Returns the indices, in order, of the curves that do not lie on a longer or earlier one."""
     if len(curves) < 2:
         return list(range(len(curves)))
     lengths = np.array([np.linalg.norm(np.diff(c, axis=0), axis=1).sum() for c in curves])
@@ -200,7 +200,7 @@ def _without_doubles(curves: list[Points]) -> list[int]:
         for other in around[within.all(axis=1)]:
             if other not in trees:
                 trees[other] = cKDTree(_dense(curves[other], _SAME_MM))
-            # Half a step of the dense points is added to the distance.
+            # Add half the spacing of the dense points to the distance.
             if trees[other].query(places)[0].max() <= 1.2 * _SAME_MM:
                 break
         else:
@@ -209,7 +209,7 @@ def _without_doubles(curves: list[Points]) -> list[int]:
 
 
 def _dense(curve: Points, step: float) -> Points:
-    """Points of a polyline at most `step` apart, its corners among them."""
+    """Returns the corners of a polyline (n, 2) and points between them, at most `step` apart."""
     corners = np.linalg.norm(np.diff(curve, axis=0), axis=1)
     pieces = [
         start + (end - start) * np.linspace(0, 1, int(np.ceil(length / step)) + 1)[:, None]

@@ -1,4 +1,4 @@
-"""The curves of a drawing."""
+"""The curves of a drawing, in mm."""
 
 from dataclasses import dataclass, field
 
@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 FLAT_MM = 0.01
-"""The approximate tolerance of the polylines that replace curves."""
+"""The approximate tolerance in mm of the polylines that replace curves."""
 
 UNITS_MM = {
     "mm": 1.0,
@@ -16,7 +16,7 @@ UNITS_MM = {
     "pt": 25.4 / 72,
     "px": 25.4 / 96,
 }
-"""The units that a drawing may be in."""
+"""The length in mm of each unit that a drawing may use."""
 
 
 @dataclass(frozen=True)
@@ -24,9 +24,9 @@ class Curve:
     """A curve of a drawing."""
 
     points: NDArray[np.float64]
-    """(n, 2), in mm, y up."""
+    """Points (n, 2) in mm, with y up."""
     filled: bool = False
-    """Whether the drawing fills it, and so shows it closed even if it is open."""
+    """Whether the drawing fills the curve. A filled curve looks closed even if it is open."""
 
 
 @dataclass(frozen=True)
@@ -35,8 +35,8 @@ class DrawnCurves:
 
     curves: list[Curve]
     measured: str
-    """How lengths were measured, a phrase for the user."""
+    """A phrase for the user that says how lengths were measured."""
     page_mm: tuple[float, float] | None = None
-    """The size of the page, where the drawing has one."""
+    """The size of the page in mm, if the drawing has one."""
     notes: list[str] = field(default_factory=list)
     """Phrases for the user on curves that were left out."""

@@ -1,4 +1,4 @@
-"""Reads the curves of DXF."""
+"""Reads the curves of DXF files."""
 
 from pathlib import Path
 from typing import Any
@@ -15,15 +15,15 @@ _NOTES = ("DIMENSION", "ARC_DIMENSION", "LARGE_RADIAL_DIMENSION", "LEADER", "MUL
 
 
 def dxf_curves(path: Path, unit_mm: float | None = None) -> DrawnCurves:
-    """The curves in a DXF's model space that are plotted.
+    """Reads the curves in a DXF's model space that are plotted.
 
     Args:
         path: the drawing.
-        unit_mm: the length of a unit of the drawing; None follows $INSUNITS, or else is the only
-            one that makes it a tool.
+        unit_mm: the length in mm of a unit of the drawing. None takes the unit from the file
+            ($INSUNITS), or else the only unit in which the drawing has the size of a tool.
 
     Raises:
-        UserError: the file is broken, or its unit is not clear.
+        UserError: the file is broken, or its unit is ambiguous.
     """
     ezdxf = import_extra(
         "ezdxf", "disassemble", "path", "units", purpose="DXF", extra="fabrication"
@@ -50,7 +50,7 @@ def dxf_curves(path: Path, unit_mm: float | None = None) -> DrawnCurves:
             try:
                 curve = ezdxf.path.make_path(entity)
             except TypeError:
-                # Not a curve, for instance text.
+                # The entity is not a curve; it is, for instance, text.
                 continue
             found += curve.sub_paths()
         box = ezdxf.path.bbox(found, fast=True)
@@ -79,14 +79,14 @@ def dxf_curves(path: Path, unit_mm: float | None = None) -> DrawnCurves:
 def _scale(
     ezdxf: Any, document: Any, path: Path, unit_mm: float | None, extent: float
 ) -> tuple[float, str]:
-    """The length in mm of a unit, and how it is known.
+    """Returns the length of a unit in mm, and a phrase that says how it is known.
 
     Raises:
-        UserError: several units make a drawing of this extent a tool.
+        UserError: the drawing would have the size of a tool in several units.
     """
     if unit_mm is not None:
         return unit_mm, f"by units of {unit_mm:g} mm as requested"
-    # The reader takes files without a header to be in metres.
+    # ezdxf assumes metres for files without a header.
     given = b"$INSUNITS" in path.read_bytes()
     units = ezdxf.units.InsertUnits(int(document.header.get("$INSUNITS", 0)) if given else 0)
     if units == ezdxf.units.InsertUnits.Unitless:
@@ -96,10 +96,11 @@ def _scale(
 
 
 def _likely(path: Path, document: Any, extent: float) -> tuple[float, str]:
-    """The only unit in which a drawing that names none is as long as a tool; mm if there is none.
+    """Returns the only unit in which a drawing without one has a tool's length; mm if there is
+    none.
 
     Raises:
-        UserError: there are several.
+        UserError: there are several such units.
     """
     names = ["mm", "inches", "cm", "m"]
     if b"$MEASUREMENT" in path.read_bytes():
@@ -108,6 +109,6 @@ def _likely(path: Path, document: Any, extent: float) -> tuple[float, str]:
     possible = [n for n in names if SHORTEST_MM <= extent * UNITS_MM[n] <= LONGEST_MM]
     if len(possible) > 1:
         readings = " or ".join(f"{extent * UNITS_MM[n]:.4g} mm (in {n})" for n in possible)
-        raise UserError(f"{path} names no unit, and may be {readings} long: give --unit")
+        raise UserError(f"{path} states no unit, and may be {readings} long: give --unit")
     name = possible[0] if possible else "mm"
-    return UNITS_MM[name], f"in {name}, because it names no unit"
+    return UNITS_MM[name], f"in {name}, because the file states no unit"

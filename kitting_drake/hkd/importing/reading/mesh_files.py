@@ -12,7 +12,7 @@ from kitting_drake.hkd.importing.reading.threemf import read_3mf
 
 FORMATS = (".stl", ".obj", ".ply", ".glb", ".gltf", ".3mf")
 IN_MM = (".3mf",)
-"""The formats that name their unit; they are read in mm."""
+"""The formats that state their unit; their vertices are converted to mm."""
 _SOLIDS = (".step", ".stp", ".iges", ".igs", ".sldprt", ".f3d", ".fcstd", ".scad", ".blend")
 MOST_BYTES = 200_000_000
 MOST_TRIANGLES = 2_000_000
@@ -22,7 +22,7 @@ Faces = NDArray[np.int64]
 
 
 def read_mesh(path: Path) -> tuple[Array, Faces]:
-    """The vertices (n, 3) and triangles (m, 3) of all visible meshes.
+    """Reads the vertices (n, 3) and triangles (m, 3) of all visible meshes of a file.
 
     Vertices are in the file's units, or in mm for the formats `IN_MM`.
 
@@ -83,5 +83,5 @@ def _scene(path: Path) -> tuple[Array, Faces]:
     except MemoryError:
         raise
     except Exception as error:
-        # The readers fail in many ways on broken files.
+        # The readers raise many types of errors on broken files.
         raise UserError(f"{path} cannot be read as {path.suffix[1:].upper()}") from error

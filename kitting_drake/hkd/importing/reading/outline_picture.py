@@ -1,4 +1,4 @@
-"""A picture of an outline as it was read, with its size."""
+"""Draws an outline as it was read, with its size."""
 
 import math
 from pathlib import Path
@@ -12,10 +12,10 @@ _TOOL, _GROUND, _TEXT = (70, 90, 120), (255, 255, 255), (30, 30, 30)
 
 
 def write_outline_picture(outline: CrossSection, path: Path) -> None:
-    """Draws an outline in mm as PNG, with its length, width and a scale of 10 mm.
+    """Draws an outline as a PNG, with its length, its width and a scale bar of 10 mm.
 
     Args:
-        outline: in mm, y up.
+        outline: the outline in mm, with y up.
         path: the PNG to write.
     """
     x_min, y_min, x_max, y_max = outline.bounds()
@@ -25,7 +25,7 @@ def write_outline_picture(outline: CrossSection, path: Path) -> None:
     width, height = (math.ceil(scale * side) + 2 * margin for side in sides)
     image = Image.new("RGB", (width, height), _GROUND)
     draw = ImageDraw.Draw(image)
-    # Loops around holes are clockwise. An area is drawn before the holes in it.
+    # Loops around holes are clockwise. Each area is drawn before the holes in it.
     loops = sorted(outline.to_polygons(), key=lambda loop: -np.ptp(loop, axis=0).prod())
     for loop in loops:
         x, y = loop.T
@@ -42,6 +42,6 @@ def write_outline_picture(outline: CrossSection, path: Path) -> None:
 
 
 def holes_text(outline: CrossSection) -> str:
-    """How many holes an outline has, in words."""
+    """Says in words how many holes an outline has."""
     holes = outline.num_contour() - len(outline.decompose())
     return "no hole" if not holes else f"{holes} {'hole' if holes == 1 else 'holes'}"

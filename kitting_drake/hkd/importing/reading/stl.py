@@ -1,7 +1,7 @@
-"""Reads STL as its many programs write it.
+"""Reads STL files, and tolerates common deviations from the format.
 
 A binary file may have bytes after its triangles, or a count of 0. A text file may lack `endsolid`,
-or have any words in its name.
+and the name of its solid may be any words.
 """
 
 import re
@@ -24,7 +24,7 @@ _FACET = re.compile(rb"^\s*facet\b", re.IGNORECASE | re.MULTILINE)
 
 
 def read_stl(path: Path) -> NDArray[np.float64]:
-    """The triangles (n, 3, 3) of a binary or text STL, in the file's units.
+    """Reads the triangles (n, 3, 3) of a binary or text STL, in the file's units.
 
     Raises:
         UserError: the file is cut short, or is not STL.
@@ -36,13 +36,13 @@ def read_stl(path: Path) -> NDArray[np.float64]:
         raise UserError(f"{path} cannot be read as STL: it is too short")
     (count,) = struct.unpack_from("<I", data, _HEADER - 4)
     present, rest = divmod(len(data) - _HEADER, _TRIANGLE.itemsize)
-    # Programs that write as they go leave a count of 0 or of all ones.
+    # Programs that write triangles one by one may leave a count of 0 or of 0xffffffff.
     if count in (0, 2**32 - 1) and present and not rest:
         count = present
     if count > present:
         raise UserError(
-            f"{path} is cut short or not an STL: by its header it has {count} triangles, and "
-            f"{count - present} of them are missing: copy or export it again"
+            f"{path} is cut short or not an STL: its header counts {count} triangles, and "
+            f"{count - present} of them are missing; copy or export it again"
         )
     triangles = np.frombuffer(data, _TRIANGLE, count, _HEADER)
     return np.asarray(triangles["corners"], dtype=np.float64)
@@ -51,15 +51,16 @@ def read_stl(path: Path) -> NDArray[np.float64]:
 def _is_text(data: bytes) -> bool:
     """Whether an STL is text.
 
-    The start does not tell, because binary files may start with `solid` too. But their count of
-    triangles, below 2**24, has a zero byte, and text has none.
+    The first word does not decide it, because a binary file may also start with `solid`. But the
+    count of triangles in a binary file is less than 2**24, so it has a zero byte, which text never
+    has.
     """
     return b"\0" not in data[:_HEADER] and re.search(rb"vertex\s", data, re.IGNORECASE) is not None
 
 
 def _text_triangles(data: bytes, path: Path) -> NDArray[np.float64]:
     data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
-    # The name of a solid may be anything, and is alone on its line.
+    # The name of a solid may be any words; it stands on a line of its own.
     facets = len(_FACET.findall(data))
     corners = _VERTEX.findall(data)
     if len(corners) != 3 * facets:
@@ -69,7 +70,7 @@ def _text_triangles(data: bytes, path: Path) -> NDArray[np.float64]:
             f"{'missing' if len(corners) < 3 * facets else 'too many'}: export it again"
         )
     try:
-        # Programs of some countries write a decimal comma.
+        # Some programs write decimal commas, depending on the country.
         flat = [float(number.replace(b",", b".")) for corner in corners for number in corner]
     except ValueError as error:
         raise UserError(f"{path} cannot be read as STL: a corner is not three numbers") from error

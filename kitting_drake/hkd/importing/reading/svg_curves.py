@@ -1,4 +1,4 @@
-"""Reads the curves of SVG."""
+"""Reads the curves of SVG files."""
 
 import io
 import math
@@ -24,18 +24,20 @@ _NOT_DRAWN = ("symbol", "mask", "marker", "clipPath", "pattern")
 
 
 def svg_curves(path: Path, unit_mm: float | None = None) -> DrawnCurves:
-    """The curves of an SVG that are drawn.
+    """Reads the visible curves of an SVG.
 
-    Lengths follow from width, height and viewBox. Pixels are 1/72 inch in files of Adobe
-    Illustrator, 1/90 inch in those of Inkscape before 0.92, else what makes the page a sheet of
-    paper, else 1/96 inch.
+    The scale follows from width, height and viewBox. If they have no units, a pixel is
+
+    - 1/72 inch in files of Adobe Illustrator, and 1/90 inch in those of Inkscape before 0.92;
+    - else the unit that makes the page a standard sheet of paper, if there is one;
+    - else 1/96 inch.
 
     Args:
         path: the drawing.
-        unit_mm: the length of a unit of the drawing; None follows the file.
+        unit_mm: the length in mm of a unit of the drawing; None takes the unit from the file.
 
     Raises:
-        UserError: the file is broken, or may be of several sizes.
+        UserError: the file is broken, or its scale is ambiguous.
     """
     svgelements = import_extra("svgelements", purpose="SVG", extra="fabrication")
     try:
@@ -50,7 +52,8 @@ def svg_curves(path: Path, unit_mm: float | None = None) -> DrawnCurves:
         drawing = svgelements.SVG.parse(stream, width=width, height=height)
         shapes = [e for e in drawing.elements() if isinstance(e, svgelements.Shape)]
         shapes = [e for e in shapes if e.values.get("visibility") not in ("hidden", "collapse")]
-        # Leave out invisible shapes, unless all are: some programs write neither fill nor line.
+        # Leave out invisible shapes. If all are invisible, keep them: some programs write neither
+        # fill nor line.
         seen = [e for e in shapes if _is_painted(e.fill) or _is_painted(e.stroke)]
         seen = [e for e in seen if str(e.values.get("opacity", 1)).strip() not in ("0", "0%")]
         curves = [
@@ -64,7 +67,7 @@ def svg_curves(path: Path, unit_mm: float | None = None) -> DrawnCurves:
     except (MemoryError, UserError):
         raise
     except Exception as error:
-        # The reader fails in many ways on broken files.
+        # The reader raises many types of errors on broken files.
         raise UserError(f"{path} cannot be read as SVG") from error
     return DrawnCurves(curves, measured, page)
 
@@ -74,13 +77,14 @@ def _is_painted(colour: Any) -> bool:
 
 
 def _scale(root: ElementTree.Element, text: bytes, unit_mm: float | None) -> tuple[float, str]:
-    """The length in mm of svgelements' pixel (1/96 inch of a length with a unit), and why.
+    """Returns the length in mm of svgelements' pixel (1/96 inch if lengths have units), and the
+    reason.
 
     Raises:
-        UserError: the drawing has no size, and nothing else tells its scale.
+        UserError: the drawing has no size, and its scale cannot be inferred.
     """
     if unit_mm is not None:
-        # Without width and height, a pixel is a unit of the drawing.
+        # Without width and height, a pixel is one unit of the drawing.
         for name in ("width", "height"):
             root.attrib.pop(name, None)
         return unit_mm, f"by units of {unit_mm:g} mm as requested"
@@ -98,31 +102,34 @@ def _scale(root: ElementTree.Element, text: bytes, unit_mm: float | None) -> tup
     if writer is not None:
         if paper and abs(25.4 / dpi / paper_mm - 1) > 1e-6:
             raise UserError(
-                f"{writer} writes pixels of 1/{dpi} inch, but its page is {paper}: give "
-                f"--length_mm, or set width and height in mm ({25.4 / dpi * sides[1]:.0f} mm or "
-                f"{paper_mm * sides[1]:.0f} mm)"
+                f"{writer} writes pixels of 1/{dpi} inch, but the page has the size of {paper}: "
+                f"give --length_mm, or set width and height in mm ({25.4 / dpi * sides[1]:.0f} mm "
+                f"or {paper_mm * sides[1]:.0f} mm)"
             )
         return 25.4 / dpi, f"by pixels of 1/{dpi} inch, as {writer} writes them"
     if paper:
         return paper_mm, f"by its page, which is {paper}"
     if given:
-        return 25.4 / 96, "by pixels of 1/96 inch, because it names no unit"
+        return 25.4 / 96, "by pixels of 1/96 inch, because it states no unit"
     readings = ", ".join(
         f"{mm * sides[1]:.0f} mm in {name}"
         for name, mm in (("mm", 1.0), ("units of 1/72 inch", 25.4 / 72), ("1/96 inch", 25.4 / 96))
     )
     size = f": its page, {sides[1]:g} units long, would be {readings}" if sides[1] else ""
     raise UserError(
-        f"the drawing gives no size in width and height{size}: set them, or give --unit or "
+        f"the drawing has no size in width and height{size}: set them, or give --unit or "
         "--length_mm"
     )
 
 
 def _paper(sides: list[float]) -> tuple[str, float]:
-    """The sheet of paper and the unit that a page's sides match, and the unit in mm; or "" and 1.
+    """Finds the sheet of paper, and the unit, for which a page's sides match a standard format.
 
     Args:
         sides: the page's sides in units, the shorter first.
+
+    Returns:
+        The names of the sheet and the unit, and the unit's length in mm; or "" and 1.
     """
     for paper, short, long in PAPERS_MM:
         for unit, mm in (("mm", 1.0), *((f"1/{n} inch", 25.4 / n) for n in _RESOLUTIONS)):
@@ -132,7 +139,7 @@ def _paper(sides: list[float]) -> tuple[str, float]:
 
 
 def _writer(root: ElementTree.Element, text: bytes) -> tuple[str | None, int]:
-    """The program that wrote an SVG, if it is known, and its pixels per inch."""
+    """Returns the program that wrote an SVG, or None if unknown, and its pixels per inch."""
     head = text[:4000]
     layers = [e.get("id", "") for e in root.iter() if e.get("data-name") or e is root]
     illustrator = b"Adobe Illustrator" in head or b"ns.adobe.com/AdobeIllustrator" in head
@@ -148,10 +155,13 @@ def _writer(root: ElementTree.Element, text: bytes) -> tuple[str | None, int]:
 
 
 def _settle_size(root: ElementTree.Element) -> tuple[float, float]:
-    """Completes the width and height of the root element; returns the viewBox's size in pixels.
+    """Completes the width and height of the root element.
 
-    A root that has only one of the two gets the other from the viewBox's aspect ratio. A root that
-    has neither has the returned size.
+    If only one of the two is given, the other follows from the viewBox's aspect ratio. If neither
+    is given, nothing is added.
+
+    Returns:
+        The width and height of the viewBox in pixels.
     """
     box = root.get("viewBox", "0 0 1000 1000").replace(",", " ").split()
     sides = {"width": float(box[2]), "height": float(box[3])}
@@ -161,7 +171,7 @@ def _settle_size(root: ElementTree.Element) -> tuple[float, float]:
             del root.attrib[name]
     given = [name for name in sides if name in root.attrib]
     for name in given:
-        # Normalize lengths, because svgelements reads `200 mm` as pixels.
+        # Normalize lengths, because svgelements reads `200 mm` as 200 pixels.
         root.set(name, "".join(_length(root.attrib[name], name)))
     if len(given) == 1 and "viewBox" in root.attrib:
         (known,) = given
@@ -172,7 +182,7 @@ def _settle_size(root: ElementTree.Element) -> tuple[float, float]:
 
 
 def _length(text: str, name: str) -> tuple[str, str]:
-    """The number and the unit (or "") of a length.
+    """Splits a length into its number and its unit, which may be "".
 
     Raises:
         UserError: the text is not a length in a known unit.
@@ -180,7 +190,7 @@ def _length(text: str, name: str) -> tuple[str, str]:
     match = _NUMBER_UNIT.fullmatch(text.strip().lower())
     if match is None or match[2] not in _UNITS:
         units = ", ".join(unit for unit in _UNITS if unit)
-        raise UserError(f"its {name} is '{text}': give a number and one of {units}")
+        raise UserError(f"its {name} is '{text}': give a number, and one of the units {units}")
     return match[1], match[2]
 
 
@@ -199,7 +209,7 @@ def _keep_from_drawing(root: ElementTree.Element) -> None:
 
 
 def _sampled(path: Iterable, mm: float) -> list[tuple[float, float]]:
-    """Points of a subpath of svgelements, in its units; one unit is `mm` mm."""
+    """Returns points of a svgelements subpath, in its units; one unit is `mm` mm."""
     points: list[tuple[float, float]] = []
     for segment in path:
         if segment.end is None:

@@ -1,6 +1,6 @@
-"""Reads 3MF, the core specification 1.3 and the production extension's parts in other files.
+"""Reads 3MF files: the core specification 1.3, and parts in other files (production extension).
 
-trimesh's own reader needs lxml, and leaves units to the caller.
+trimesh's own reader is not used, because it needs lxml and ignores the unit.
 """
 
 import posixpath
@@ -28,25 +28,25 @@ _MOST_BYTES = 1_000_000_000
 _DEEPEST = 16
 
 Transform = NDArray[np.float64]
-"""(4, 3): a point is (x, y, z, 1) times it."""
+"""A transform (4, 3) that maps a point to (x, y, z, 1) @ transform."""
 
 
 @dataclass
 class _Object:
-    """An object of a model: a mesh, or other objects moved, or both."""
+    """An object of a model: a mesh, other objects with transforms, or both."""
 
     vertices: NDArray[np.float64]
     faces: NDArray[np.int64]
     parts: list[tuple[str, str, Transform]]
-    """File, object and transform of each part."""
+    """The file, object identifier and transform of each part."""
     is_solid: bool
 
 
 def read_3mf(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Vertices (n, 3), in mm, and triangles (m, 3) of all objects that a 3MF builds.
+    """Returns the vertices (n, 3) in mm and triangles (m, 3) of all objects in a 3MF's build list.
 
     Raises:
-        UserError: the file is broken, or builds nothing.
+        UserError: the file is broken, or its build list is empty.
     """
     try:
         with zipfile.ZipFile(path) as archive:
@@ -81,7 +81,7 @@ def read_3mf(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
 
 
 def _main_part(archive: zipfile.ZipFile) -> str:
-    """The name of the model that the package starts from."""
+    """Returns the name of the model file at which the package starts."""
     names = {name.lower(): name for name in archive.namelist()}
     relations = ElementTree.fromstring(archive.read(names["_rels/.rels"]))
     targets = [e.get("Target", "") for e in relations if e.get("Type") == _RELATION]
@@ -111,7 +111,7 @@ def _objects(
 
 
 def _reference(element: ElementTree.Element, file: str, names: dict[str, str]) -> tuple[str, str]:
-    """The file and the identifier of the object that an item or component names."""
+    """Returns the file and the identifier of the object to which an item or component refers."""
     other = [value for key, value in element.attrib.items() if key.endswith("}path")]
     if other:
         file = names[posixpath.normpath(other[0]).strip("/").lower()]
@@ -128,7 +128,7 @@ def _transform(element: ElementTree.Element) -> Transform:
 def _placed(
     objects: dict[tuple[str, str], _Object], key: tuple[str, str], by: Transform, deepest: int
 ) -> Iterator[tuple[NDArray[np.float64], NDArray[np.int64]]]:
-    """The meshes of an object and its parts, moved."""
+    """Yields the meshes of an object and its parts, with their transforms applied."""
     thing = objects.get(key)
     if thing is None or not thing.is_solid or deepest == 0:
         return

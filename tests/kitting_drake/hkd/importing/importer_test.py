@@ -244,7 +244,7 @@ def test_a_tool_weighs_what_the_scale_says(plain: importer.ImportReport, tmp_pat
     assert weighed.record["center_of_mass"] == plain.record["center_of_mass"]
     assert any("guess" in note for note in plain.notes)
     for options, token in (
-        ({"mass_g": 9000.0}, "does not weigh 9000 g"),
+        ({"mass_g": 9000.0}, "cannot weigh 9000 g"),
         ({"material": "cheese"}, "steel, aluminium"),
         ({"material": "wood", "density": 700.0}, "leave out one"),
         ({"unit": "ells"}, "mm, cm, m, inches"),
@@ -339,7 +339,7 @@ def sheet() -> trimesh.Trimesh:
         (lambda: trimesh.creation.box((180, 150, 20)), "jaws"),
         (lambda: trimesh.creation.box((160, 150, 10)), "65 mm"),
         (sheet, "no volume"),
-        (apart, "2 separate things"),
+        (apart, "2 separate objects"),
     ],
 )
 def test_an_unusable_mesh_is_rejected(

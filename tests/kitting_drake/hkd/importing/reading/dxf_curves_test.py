@@ -115,7 +115,7 @@ def test_a_drawing_without_a_unit_is_in_mm_or_as_asked(header: str, tmp_path: Pa
     path.write_text(f"{header}  0\nSECTION\n  2\nENTITIES\n{lines}  0\nENDSEC\n  0\nEOF\n")
     drawing = read_drawing(path)
     assert drawing.outline.bounds() == pytest.approx((0, 0, 160, 20), abs=1e-6)
-    assert "mm, because it names no unit" in drawing.measured
+    assert "because the file states no unit" in drawing.measured
     assert read_drawing(path, 25.4).outline.area() == pytest.approx(25.4**2 * 3200, rel=1e-6)
 
 
