@@ -34,7 +34,7 @@ def list_tools(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
 
 def generate(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
     """Regenerates models and prints how closely their collision hulls match the visual shape."""
-    table = Table(caption="outline, top, grip: collision hulls against the visual shape, mm")
+    table = Table(caption="outline, top, grip: largest distance of the collision hulls, in mm")
     table.add_column("name", no_wrap=True)
     for heading in ("triangles", "hulls", "outline", "top", "grip", "tilt, deg"):
         table.add_column(heading, justify="right")
@@ -50,14 +50,14 @@ def generate(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
 
 def sheet(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
     """Renders the contact sheet."""
-    # Drake is slow to import, and only this verb needs it.
+    # Import Drake lazily, because it is slow to import.
     from kitting_drake.hkd.kits.kit import make_kit
     from kitting_drake.hkd.kits.parameters import KitParameters
     from kitting_drake.hkd.sheet import kit_subject, tool_subject, write_sheet
 
     if args.kits:
         if args.names:
-            raise UserError(f"--kits draws kits, not '{args.names[0]}': leave out one of the two")
+            raise UserError(f"--kits draws kits, not tools: leave out --kits or '{args.names[0]}'")
         chosen = toolsets(args.split)[: args.kits]
         kits = [make_kit([load_named(name) for name in names], KitParameters()) for names in chosen]
         subjects = [kit_subject(f"{args.split} {i:03d}", kit) for i, kit in enumerate(kits)]
@@ -143,7 +143,7 @@ def kit(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
         robot="" if args.robot is None else _robot_text(args.robot),
     )
     if args.prove:
-        # Import Drake lazily, and fail early.
+        # Import Drake lazily, and early enough that a missing Drake is reported before any work.
         from kitting_drake.common.rendering import require_rendering
 
         require_rendering()
@@ -161,7 +161,6 @@ def kit(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
 
 
 def _prove(folder: Path, episodes: int, console: Console) -> None:
-    # Import Drake lazily.
     from kitting_drake.evaluation.kit_proof import prove_kit
 
     with Console(stderr=True, quiet=console.quiet).status("proving the kit") as status:
@@ -174,11 +173,11 @@ def _prove(folder: Path, episodes: int, console: Console) -> None:
 
 
 _SCENES = 20
-"""Number of scenes in which the reach of a robot is checked."""
+"""The number of scenes in which the reach of a robot arm is checked."""
 
 
 def _robot_text(path: Path) -> str:
-    """Lines of a scenario with the arm of a file.
+    """Reads the arm of a robot file and returns it as lines of a scenario.
 
     Raises:
         UserError: the file is invalid, or the arm stands in the workspace.
@@ -200,9 +199,9 @@ def _robot_text(path: Path) -> str:
 def _check_scenario(path: Path, console: Console) -> bool:
     """Prints how to run a kit's scenario, or why it cannot be run; returns whether it can.
 
-    For an arm, also prints how often it reaches everything.
+    For an arm, it also prints in how many scenes the arm reaches everything.
     """
-    # The loader is slow to import, and the other verbs do not need it.
+    # Import the loader lazily, because it is slow to import.
     from kitting_drake.scenario.loader import load_scenario
     from kitting_drake.scenario.robots import FrankaArm
     from systems.signals import PixelGrid
@@ -212,8 +211,8 @@ def _check_scenario(path: Path, console: Console) -> bool:
         scenario.task.make_scene(grid=PixelGrid(), seed=0, base=path.parent)
     except UserError:
         console.print(
-            "  the simulated table has no room for this block and its tools: make a smaller block "
-            "or use fewer tools to `run` it",
+            "  the simulated table has no room for this block and its tools: to `run` it, make a "
+            "smaller block or use fewer tools",
             soft_wrap=True,
         )
         return False
@@ -229,10 +228,10 @@ def _check_scenario(path: Path, console: Console) -> bool:
 
 
 def _reach_note(scenario: Scenario, base: Path) -> str:
-    """In how many scenes an arm reaches all cavities and tools of a kit.
+    """Says in how many scenes an arm reaches all cavities and tools of a kit.
 
     Raises:
-        UserError: it cannot reach its home.
+        UserError: the arm cannot reach its home.
     """
     from kitting_drake.station.robot import make_motion
     from kitting_drake.station.scene_reach import scene_problems
@@ -249,11 +248,11 @@ def _reach_note(scenario: Scenario, base: Path) -> str:
         reached += not problems
         first = first or (problems[0] if problems else "")
     found = f"the arm reaches all cavities and tools in {reached} of {_SCENES} scenes"
-    return f"{found}; in another one {first}" if first else found
+    return f"{found}; in one of the others, {first}" if first else found
 
 
 def main() -> int:
-    """Runs one verb and returns the exit status."""
+    """Runs one command and returns the exit status."""
     parser = argparse.ArgumentParser(prog="python -m kitting_drake.hkd", description=__doc__)
     verbs = parser.add_subparsers(dest="verb", required=True)
     for name, function in (("list", list_tools), ("generate", generate), ("sheet", sheet)):
@@ -305,34 +304,39 @@ def _describe_import(importer: argparse.ArgumentParser) -> None:
     importer.add_argument(
         "--category",
         required=True,
-        help=f"the tool's category: {', '.join(CATEGORIES)}, or a name of your own",
+        help=f"the tool's category: {', '.join(CATEGORIES)}, or any other name",
     )
-    importer.add_argument("--name", help="the tool's name (default: the file's)")
+    importer.add_argument("--name", help="the tool's name (default: the file's name)")
     importer.add_argument(
         "--output",
         type=Path,
         metavar="DIR",
-        help="the folder of tools to add it to (default: $KITTING_DRAKE_TOOLS or the user's own)",
+        help="the folder in which to put the tool (default: $KITTING_DRAKE_TOOLS, or a folder in "
+        "~/.local/share)",
     )
     importer.add_argument(
         "--length_mm",
         type=float,
-        help="scale to this length (default: the true length)",
+        help="the length in mm to scale to (default: the true length)",
     )
     importer.add_argument(
-        "--unit", help="the file's unit: mm, cm, m, inches, or an outline's pt (1/72 inch) or px"
+        "--unit",
+        help="the file's unit: mm, cm, m or inches; for an outline also pt (1/72 inch) or px",
     )
-    importer.add_argument("--height_mm", type=float, help="the height of an extruded outline")
-    importer.add_argument("--mass_g", type=float, help="the tool's mass in grams, as weighed")
+    importer.add_argument(
+        "--height_mm", type=float, help="the height in mm to which an outline is extruded"
+    )
+    importer.add_argument("--mass_g", type=float, help="the weighed mass of the tool in grams")
     importer.add_argument(
         "--material",
-        help="what the whole tool is of: steel, aluminium, brass, titanium, wood, plastic, rubber",
+        help="the material of the whole tool: steel, aluminium, brass, titanium, wood, plastic "
+        "or rubber",
     )
     importer.add_argument(
         "--density",
         type=float,
         metavar="KG_M3",
-        help="the density of the whole tool (default: the category's)",
+        help="the density of the whole tool in kg/m^3 (default: the category's)",
     )
     importer.add_argument("--quiet", action="store_true", help="print nothing but errors")
     importer.set_defaults(function=import_mesh)
@@ -340,31 +344,40 @@ def _describe_import(importer: argparse.ArgumentParser) -> None:
 
 def _describe_kit(maker: argparse.ArgumentParser) -> None:
     maker.add_argument("tools", nargs="+", metavar="TOOL", help="names or folders of tools")
-    maker.add_argument("--output", type=Path, required=True, metavar="DIR", help="the kit's folder")
+    maker.add_argument(
+        "--output", type=Path, required=True, metavar="DIR", help="the folder to write"
+    )
     room = maker.add_mutually_exclusive_group()
     room.add_argument(
-        "--clearance_mm", type=float, help="between a tool and its cavity's wall (default: 2)"
+        "--clearance_mm",
+        type=float,
+        help="the clearance between a tool and its cavity's wall (default: 2)",
     )
     room.add_argument(
         "--fit",
         choices=("snug", "easy", "loose"),
-        help="the same by name: 0.15, 0.35 or 0.75 mm a side",
+        help="the clearance by name: 0.15, 0.35 or 0.75 mm on each side",
     )
     maker.add_argument(
         "--compensate_mm",
         type=float,
         default=0.0,
-        help="by how much your printer or router makes cavities too narrow, a side: half of what "
-        "the hole of test_piece.stl lacks to 20 mm (default: 0)",
+        help="how much too narrow your printer or router makes cavities, on each side. It is "
+        "half the difference between 20 mm and the printed hole of test_piece.stl (default: "
+        "0)",
     )
-    maker.add_argument("--lead_in_mm", type=float, help="the bevel of the rims (default: 1)")
-    maker.add_argument("--wall_mm", type=float, help="between and around the cavities (default: 6)")
+    maker.add_argument(
+        "--lead_in_mm", type=float, help="the width of the bevel around the rims (default: 1)"
+    )
+    maker.add_argument(
+        "--wall_mm", type=float, help="the wall between and around the cavities (default: 6)"
+    )
     maker.add_argument(
         "--block_mm",
         type=float,
         nargs=3,
         metavar=("LENGTH", "WIDTH", "HEIGHT"),
-        help="the block's size (default: as small as possible, 50 high)",
+        help="the block's size (default: as small as possible, and 50 high)",
     )
     maker.add_argument(
         "--prove",
@@ -372,14 +385,16 @@ def _describe_kit(maker: argparse.ArgumentParser) -> None:
         nargs="?",
         const=10,
         metavar="N",
-        help="kit it N (10) times in simulation, with a printer's errors, and write proof.html",
+        help="simulate the kitting N times (10 if N is left out) with the errors of a printer, "
+        "and write proof.html",
     )
     maker.add_argument("--notches", action="store_true", help="add finger notches")
     maker.add_argument(
         "--robot",
         type=Path,
         metavar="ROBOT.yaml",
-        help="the scenario's arm, as for decide; says how often it reaches everything",
+        help="a file with the robot arm, as for `decide`; reports how often the arm reaches "
+        "everything",
     )
     maker.add_argument("--labels", action="store_true", help="engrave the tools' names")
     maker.add_argument("--quiet", action="store_true", help="print nothing but errors")

@@ -1,4 +1,5 @@
-"""`hkd annotate NAME`: a Meshcat page to move a gripper over a tool and save its grasp."""
+"""A Meshcat page on which a user moves a gripper over a tool and saves a grasp (`hkd annotate
+NAME`)."""
 
 import dataclasses
 import math
@@ -34,12 +35,13 @@ _HAND_MESHES = MODELS / "franka_hand" / "meshes"
 
 
 def measure_grasp(tool: Tool, x: float, y: float, theta: float) -> Grasp | None:
-    """The grasp that results when the jaws close at a given pose.
+    """Measures the grasp that results when the jaws close at a given pose.
 
     Args:
-        tool: at rest in its frame T.
-        x: x of the middle of the pads in T, in metres.
-        y: as x. Only its component along the pads counts, because closing jaws centre the tool.
+        tool: the tool, at rest in its frame T.
+        x: the x of the middle of the pads in T, in metres.
+        y: the y of the middle of the pads in T, in metres. Closing jaws centre the tool, so only
+            the component of (x, y) along the pads matters.
         theta: the rotation of the hand about T's z, in radians.
 
     Returns:
@@ -62,12 +64,12 @@ def measure_grasp(tool: Tool, x: float, y: float, theta: float) -> Grasp | None:
 def save_grasp(tool: Tool, grasp: Grasp, models: Path = MODELS) -> None:
     """Saves a grasp as the tool's annotated one.
 
-    A tool of the catalogue gets it in the catalogue and is generated again. Any other tool gets it
-    in its record.
+    A tool of the catalogue is changed in the catalogue and generated again. For any other tool, the
+    grasp is written to its record.
 
     Args:
         tool: the tool.
-        grasp: in its frame T.
+        grasp: the grasp in the tool's frame T.
         models: the folder with the catalogue in `tools/`.
 
     Raises:
@@ -76,16 +78,16 @@ def save_grasp(tool: Tool, grasp: Grasp, models: Path = MODELS) -> None:
     """
     if grasp.width > WIDEST:
         raise UserError(
-            f"the tool is {1e3 * grasp.width:.0f} mm wide there, but the jaws take only "
-            f"{1e3 * WIDEST:.0f} mm: grasp it where it is narrower"
+            f"the tool is {1e3 * grasp.width:.0f} mm wide at this place, but the jaws open only "
+            f"to {1e3 * WIDEST:.0f} mm: grasp it where it is narrower"
         )
     if tool.directory.parent != models / "tools":
         record_path = tool.directory / "tool.yaml"
         record = yaml.safe_load(record_path.read_text())
         record["grasp"] = {key: round(value, 6) for key, value in dataclasses.asdict(grasp).items()}
-        # The others were proposed for another first one.
+        # Drop the other grasps, because they were chosen to complement another first grasp.
         record.pop("other_grasps", None)
-        # A repeated import keeps an annotated grasp.
+        # Mark the grasp, so that a repeated import keeps it.
         record["annotated"] = True
         write_atomically(record_path, yaml.safe_dump(record, sort_keys=False))
         return
@@ -101,7 +103,7 @@ def save_grasp(tool: Tool, grasp: Grasp, models: Path = MODELS) -> None:
 
 
 def with_grasp(catalogue: str, name: str, grasp: Grasp) -> str:
-    """The catalogue's text with one tool's grasp replaced; comments and all else are kept.
+    """Replaces one tool's grasp in the catalogue's text; keeps everything else, including comments.
 
     Raises:
         UserError: the catalogue has no such tool.
@@ -115,22 +117,24 @@ def with_grasp(catalogue: str, name: str, grasp: Grasp) -> str:
     )
     changed, count = entry.subn(lambda match: match[1] + text, catalogue)
     if count != 1:
-        raise UserError(f"the catalogue has no tool '{name}' whose grasp is on one line")
+        raise UserError(f"the catalogue has no tool '{name}' with its grasp on one line")
     return changed
 
 
 class AnnotationPage:
-    """The page with the tool, the hand over it, sliders and buttons.
+    """The page with the tool, the hand above it, sliders and buttons.
 
-    The sliders move the hand. "take proposal" moves it to the proposal that the first slider picks.
+    The sliders move the hand. The button "take proposal" moves it to the proposal that the first
+    slider selects.
     """
 
     def __init__(self, tool: Tool, proposals: list[GraspProposal], meshcat: Meshcat) -> None:
-        """
+        """Opens the page.
+
         Args:
             tool: the tool to annotate.
-            proposals: best first.
-            meshcat: serves the page.
+            proposals: the proposed grasps, best first.
+            meshcat: the server of the page.
         """
         self._tool = tool
         self._proposals = proposals
@@ -189,7 +193,7 @@ class AnnotationPage:
         for path, rgba in zip(tool.visual_meshes, _colours(tool), strict=True):
             meshcat.SetObject(f"tool/{path.stem}", Mesh(path), rgba)
         for rank, proposal in enumerate(self._proposals):
-            # Green is the best, red the worst.
+            # Draw the best proposal in green and the worst in red.
             share = rank / max(len(self._proposals) - 1, 1)
             path_name = f"proposals/{rank + 1}"
             meshcat.SetObject(path_name, Sphere(0.002), Rgba(share, 1 - share, 0.1))
@@ -219,7 +223,7 @@ class AnnotationPage:
 
 
 def _colours(tool: Tool) -> list[Rgba]:
-    """The colour of each visual mesh in the SDFormat model."""
+    """Returns the colour of each visual mesh in the SDFormat model."""
     text = tool.sdf.read_text()
     colours = []
     for path in tool.visual_meshes:
@@ -229,7 +233,7 @@ def _colours(tool: Tool) -> list[Rgba]:
 
 
 def proposal_table(tool: Tool, proposals: list[GraspProposal]) -> Table:
-    """The ranked proposals and the tool's annotated grasp."""
+    """Makes a table of the ranked proposals and the tool's annotated grasp."""
     table = Table(title=f"grasps of {tool.name}, best first", title_justify="left")
     for heading in (
         "rank",
@@ -237,7 +241,7 @@ def proposal_table(tool: Tool, proposals: list[GraspProposal]) -> Table:
         "y mm",
         "rotation deg",
         "width mm",
-        "from centre of mass mm",
+        "mm from centre of mass",
         "cost",
     ):
         table.add_column(heading, justify="right")
@@ -261,7 +265,7 @@ def _numbers(grasp: Grasp) -> list[str]:
 
 
 def annotate(name: str, console: Console) -> None:
-    """Serves the page on localhost until "done" is clicked or Ctrl-C is pressed.
+    """Serves the page on localhost until the user clicks "done" or presses Ctrl-C.
 
     Raises:
         UserError: the tool does not exist, or no port is free.
@@ -276,10 +280,13 @@ def annotate(name: str, console: Console) -> None:
     try:
         meshcat = Meshcat(MeshcatParams(host="localhost", show_stats_plot=False))
     except RuntimeError as error:
-        raise UserError("Meshcat found no free port from 7000 to 7099: close viewers") from error
+        raise UserError(
+            "Meshcat found no free port from 7000 to 7099: close other Meshcat pages"
+        ) from error
     page = AnnotationPage(tool, proposals, meshcat)
     console.print(
-        f"annotate at {meshcat.web_url()}: open the controls, move, save", highlight=False
+        f"annotate at {meshcat.web_url()}: open the controls, move the hand, and save",
+        highlight=False,
     )
     saved = 0
     while not page.clicks("done"):

@@ -1,4 +1,4 @@
-"""`hkd build`: the whole dataset with a manifest, for other simulators."""
+"""Writes the whole dataset with a manifest, for other simulators (`hkd build`)."""
 
 import hashlib
 import os
@@ -22,14 +22,14 @@ from kitting_drake.hkd.tools.toolsets import PAPER_SPLITS, TOOLSETS_SEED, tool_p
 def build_dataset(
     folder: Path, progress: Callable[[int, int], None], *, mjcf: bool = False
 ) -> dict[str, Any]:
-    """Writes the paper's tools and kits as SDFormat with their meshes, and `manifest.json`.
+    """Writes the paper's tools and kits as SDFormat models with their meshes, and `manifest.json`.
 
     The folder appears atomically. Tools are in `tools/NAME/`, kits in `kits/SPLIT_000/`. Models
-    name their meshes relatively, so each model's folder can be moved.
+    refer to their meshes by relative paths, so each model's folder can be moved.
 
     Args:
-        folder: the folder to write; must be empty or not exist.
-        progress: called with the number of kits written and the number of all kits.
+        folder: the folder to write; it must be empty or not exist.
+        progress: a function called with the number of kits written and the number of all kits.
         mjcf: whether to write MuJoCo's `NAME.xml` and `kit.xml` beside each SDFormat model.
 
     Returns:
@@ -115,7 +115,7 @@ def _kit_entry(name: str, split: str, kit: Kit, root: Path) -> dict[str, Any]:
         "split": split,
         **_models(folder / kit.sdf.name, root),
         "size": list(kit.size),
-        # The pose of each seated tool's frame in the kit's frame; yaw is about the kit's z.
+        # The pose of each seated tool's frame T in the kit's frame K; yaw is about the kit's z.
         "tools": [
             {"name": tool.name, "position": [pose.x, pose.y, pose.z], "yaw": pose.yaw}
             for tool, pose in zip(kit.tools, kit.layout.poses, strict=True)
@@ -125,7 +125,7 @@ def _kit_entry(name: str, split: str, kit: Kit, root: Path) -> dict[str, Any]:
 
 
 def _models(sdf: Path, root: Path) -> dict[str, str]:
-    """The paths of a model in each format written."""
+    """Returns the paths of a model, relative to `root`, by format."""
     paths = {"sdf": sdf, "mjcf": sdf.with_suffix(".xml")}
     return {key: path.relative_to(root).as_posix() for key, path in paths.items() if path.exists()}
 

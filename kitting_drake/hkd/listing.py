@@ -1,4 +1,4 @@
-"""`hkd list`: a table of the available tools."""
+"""Prints a table of the available tools (`hkd list`)."""
 
 from pathlib import Path
 from typing import Any
@@ -13,11 +13,11 @@ from kitting_drake.hkd.generation.catalogue import CatalogueError, ToolEntry
 from kitting_drake.hkd.tools.tool import load_tool, user_tool_names, user_tools
 
 _LIST_WIDTH = 1000
-"""Columns of a terminal that cuts no cell."""
+"""The number of columns of a terminal that truncates no cell."""
 
 
 def chosen_entries(entries: list[ToolEntry], names: list[str]) -> list[ToolEntry]:
-    """The named entries in the catalogue's order, or all entries if no name is given.
+    """Returns the named entries in the catalogue's order, or all entries if no name is given.
 
     Raises:
         CatalogueError: a name is not in the catalogue.
@@ -26,7 +26,7 @@ def chosen_entries(entries: list[ToolEntry], names: list[str]) -> list[ToolEntry
     for name in names:
         if name not in known:
             raise CatalogueError(
-                f"no tool is called {name!r}; the catalogue has {', '.join(sorted(known))}"
+                f"no tool is called {name!r}: the catalogue has {', '.join(sorted(known))}"
             )
     return [entry for entry in entries if not names or entry.name in names]
 
@@ -34,7 +34,9 @@ def chosen_entries(entries: list[ToolEntry], names: list[str]) -> list[ToolEntry
 def chosen_with_own(
     entries: list[ToolEntry], names: list[str]
 ) -> tuple[list[ToolEntry], list[str]]:
-    """The entries and the user's own tools that have these names; all of them without names.
+    """Returns the catalogue's entries and the user's own tools with the given names.
+
+    Without names, it returns all of them.
 
     Raises:
         CatalogueError: a name is unknown.
@@ -45,13 +47,13 @@ def chosen_with_own(
 
 
 def print_tools(models: Path, entries: list[ToolEntry], names: list[str], console: Console) -> None:
-    """Prints a table of generated tools and the user's own, then a line for each broken tool.
+    """Prints a table of generated tools and the user's own, and a line for each broken tool.
 
     Args:
         models: the folder with `tools/`.
         entries: the entries of the catalogue.
         names: the tools to print; all of them if empty.
-        console: widened to the table's width.
+        console: the console to print to; it is widened to the table's width.
 
     Raises:
         CatalogueError: a name is unknown, or a tool has not been generated.
@@ -67,7 +69,7 @@ def print_tools(models: Path, entries: list[ToolEntry], names: list[str], consol
             continue
         records.append(yaml.safe_load((user_tools() / name / "tool.yaml").read_text()))
     table = _table(records)
-    # Users copy names into other commands, so never truncate them.
+    # Never truncate names, because users copy them into other commands.
     wide = console.options.update(width=_LIST_WIDTH)
     console.width = max(console.width, Measurement.get(console, wide, table).maximum)
     console.print(table)
@@ -90,7 +92,7 @@ def _table(records: list[dict[str, Any]]) -> Table:
         table.add_column(heading, no_wrap=True)
     for heading in ("size, mm", "mass, g", "grasp, mm"):
         table.add_column(heading, justify="right", no_wrap=True)
-    # Show the symmetry only where a tool has one, to keep the table narrow.
+    # Show the symmetry only for tools that have one, to keep the table narrow.
     symmetric = any(record.get("symmetry", 1) != 1 for record in records)
     if symmetric:
         table.add_column("symmetry", justify="right", no_wrap=True)
@@ -108,5 +110,5 @@ def _table(records: list[dict[str, Any]]) -> Table:
 
 
 def size_text(record: dict[str, Any]) -> str:
-    """A tool's length, width and height in mm, from its record."""
+    """Returns a tool's length, width and height in mm as text, from its record."""
     return " x ".join(f"{1e3 * record[key]:.0f}" for key in ("length", "width", "height"))

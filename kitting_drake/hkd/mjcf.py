@@ -1,8 +1,8 @@
 """MuJoCo models (MJCF) of tools and kits, converted from their SDFormat models.
 
-MuJoCo replaces every collision mesh by its convex hull. A tool's collision meshes are convex. A
-kit's block is cut into upright convex prisms. They are exact except for the bevel around the rims,
-which becomes one step of half its width and its whole depth.
+MuJoCo replaces every collision mesh by its convex hull. A tool's collision meshes are convex
+already. A kit's block is cut into upright convex prisms. They are exact except for the bevel around
+the rims, which becomes one step of half its width and its whole depth.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ from kitting_drake.common.errors import UserError
 
 _DRAKE = "{http://drake.mit.edu}"
 _TORSION, _ROLLING = 0.002, 0.0001
-"""MuJoCo's default torsional and rolling friction in m; Drake models neither."""
+"""MuJoCo's default torsional and rolling friction in m. Drake models neither."""
 _LEVEL = 1e-5
-"""Heights of a block that differ by less count as equal, in m."""
+"""The difference below which two heights of a block count as equal, in m."""
 _TOLERANCE = 5e-5
 """The simplification tolerance of outlines, in m."""
 _SLIVER = 1e-9
-"""Smaller triangles are dropped, in m^2."""
+"""The area below which triangles are dropped, in m^2."""
 
 
 def tool_mjcf(sdf: Path) -> str:
-    """The MJCF of a tool: one free body with the model's name, in the tool frame T.
+    """Returns the MJCF of a tool: one free body with the model's name, in the tool frame T.
 
     Args:
-        sdf: the SDFormat model, of one link. The result uses the same mesh paths.
+        sdf: the SDFormat model, of one link. The result refers to the same mesh files.
 
     Raises:
         UserError: the file is missing or is not a tool's model.
@@ -75,10 +75,10 @@ def _tool(name: str, link: ElementTree.Element) -> str:
 
 
 def kit_mjcf(sdf: Path) -> str:
-    """The MJCF of a kit: one fixed body `kit`, in the kit frame K.
+    """Returns the MJCF of a kit: one fixed body `kit`, in the kit frame K.
 
     Args:
-        sdf: the SDFormat model; `kit.obj` and the visual meshes lie beside it.
+        sdf: the SDFormat model; `kit.obj` and the visual meshes must be in the same folder.
 
     Raises:
         UserError: the model or its block is missing, or the file is not a kit's model.
@@ -125,7 +125,7 @@ def block_prisms(
         for low, high in itertools.pairwise(levels)
     ]
     prisms: list[NDArray[np.float64]] = []
-    # From the top: each layer's new area becomes prisms down to the bottom.
+    # Start at the top: the area that each layer adds becomes prisms down to the bottom.
     above = CrossSection()
     for layer, top in zip(reversed(layers), reversed(levels[1:]), strict=True):
         prisms += [_prism(part, levels[0], top) for part in _convex_parts(layer - above)]
@@ -134,7 +134,7 @@ def block_prisms(
 
 
 def _convex_parts(region: CrossSection) -> list[NDArray[np.float64]]:
-    """The corners (3, 2) of triangles that cover a region."""
+    """Returns the corners (3, 2) of triangles that cover a region."""
     loops = [np.asarray(loop) for loop in region.to_polygons()]
     if not loops:
         return []
@@ -152,7 +152,7 @@ def _prism(polygon: NDArray[np.float64], bottom: float, top: float) -> NDArray[n
 
 
 def _child(element: ElementTree.Element, path: str) -> ElementTree.Element:
-    """The element at a path; raises ValueError if it is missing."""
+    """Returns the element at a path; raises ValueError if it is missing."""
     child = element.find(path)
     if child is None:
         raise ValueError(f"{path} is missing")
@@ -160,7 +160,7 @@ def _child(element: ElementTree.Element, path: str) -> ElementTree.Element:
 
 
 def _name(element: ElementTree.Element) -> str:
-    """The attribute `name`; raises ValueError if it is missing."""
+    """Returns the attribute `name` of an element; raises ValueError if it is missing."""
     name = element.get("name")
     if not name:
         raise ValueError(f"a {element.tag} has no name")

@@ -1,4 +1,4 @@
-"""Contact sheets of tools and kits, rendered without a display by Drake's VTK engine."""
+"""Renders contact sheets of tools and kits with Drake's VTK engine, without a display."""
 
 import io
 from collections.abc import Iterable, Sequence
@@ -32,7 +32,7 @@ from kitting_drake.hkd.kits.parameters import KitParameters
 from kitting_drake.hkd.tools.tool import Tool
 
 _BACKGROUND = (0.97, 0.97, 0.96)
-# A key light that casts the shadows, and a fill light from the camera, whose shadows are hidden.
+# A key light casts the shadows. The fill light is at the camera, where its shadows are hidden.
 _LIGHTS = [
     LightParameter(
         type="directional",
@@ -54,10 +54,11 @@ _LIGHTS = [
 def camera_pose(
     target: np.ndarray, azimuth_deg: float, elevation_deg: float, distance: float
 ) -> RigidTransform:
-    """X_WC of a camera that looks at `target` (m) from the given side: +z forward, y down."""
+    """Returns X_WC of a camera that looks at `target` (m) from the given side: +z forward, y
+    down."""
     a, e = np.radians([azimuth_deg, elevation_deg])
     toward = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
-    # The camera's right is level, and defined even when looking straight down.
+    # The camera's right is horizontal, and is defined even when the camera looks straight down.
     right = np.array([-np.sin(a), np.cos(a), 0.0])
     R_WC = RotationMatrix(np.column_stack([right, np.cross(-toward, right), -toward]))
     return RigidTransform(R_WC, target + distance * toward)
@@ -69,9 +70,9 @@ class Subject:
 
     title: str
     models: Sequence[tuple[Path, RigidTransform]]
-    """SDFormat files of one link each, and the poses of these links."""
+    """Pairs of an SDFormat file with one link, and the pose of this link in the world."""
     target: tuple[float, float, float]
-    """The point that the camera looks at, in metres."""
+    """The point in the world at which the camera looks, in metres."""
     size: float
     """The width of the view at the target, in metres."""
     elevation_deg: float = 38.0
@@ -80,19 +81,19 @@ class Subject:
 def tool_subject(tool: Tool) -> Subject:
     """A tool at rest on the table."""
     title = tool.name.replace("_", " ")
-    # A tool larger than the dataset's is seen from further away.
+    # View tools that are larger than the dataset's from farther away.
     size = 0.208 * max(1.0, tool.length / 0.2, tool.width / 0.13)
     return Subject(title, [(tool.sdf, RigidTransform())], (0.0, 0.0, 0.006), size)
 
 
 def kit_subject(title: str, kit: Kit) -> Subject:
-    """A kit on the table with all tools seated but the last, to show one empty cavity."""
+    """A kit on the table. All tools but the last are seated, to show one empty cavity."""
     seated = [
         (tool.sdf, RigidTransform(RollPitchYaw(0, 0, pose.yaw), [pose.x, pose.y, pose.z]))
         for tool, pose in zip(kit.tools[:-1], kit.layout.poses[:-1], strict=True)
     ]
     models = [(kit.sdf, RigidTransform()), *seated]
-    # A block of the template's size fills the picture; a larger one is seen from further away.
+    # A block of the template's size fills the picture; view a larger block from farther away.
     template = KitParameters()
     size = 0.52 * max(1.0, kit.size[0] / template.length, kit.size[1] / template.width)
     return Subject(title, models, (0.0, 0.0, 0.02), size, elevation_deg=52.0)
@@ -125,7 +126,7 @@ def render_subject(
     diagram = builder.Build()
     context = diagram.CreateDefaultContext()
 
-    # A distant camera keeps parallel edges nearly parallel.
+    # Use a distant camera, which keeps parallel edges nearly parallel.
     distance = 3.46 * subject.size
     field_of_view = 2 * np.arctan(subject.size / distance / 2 * height / width)
     pose = camera_pose(np.array(subject.target), azimuth_deg, subject.elevation_deg, distance)
@@ -155,15 +156,15 @@ def write_sheet(subjects: Iterable[Subject], count: int, output: Path) -> None:
     """Writes one picture of all the subjects with their titles.
 
     Args:
-        subjects: what to draw.
-        count: how many they are.
-        output: the PNG file.
+        subjects: the contents of the pictures.
+        count: the number of subjects.
+        output: the PNG file to write.
 
     Raises:
         UserError: rendering is not available, or the picture cannot be written.
     """
     require_rendering()
-    # matplotlib is slow to import, and the other verbs do not need it.
+    # Import matplotlib lazily, because it is slow to import.
     import matplotlib
 
     matplotlib.use("Agg")

@@ -1,4 +1,4 @@
-"""Hammers: a forged head on a wooden handle. They lie on their side with the face toward +y."""
+"""Generates hammers: a forged head on a handle. They lie on their side with the face toward +y."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -24,43 +24,44 @@ from kitting_drake.hkd.tools.solids import (
 class HammerParameters:
     """A claw hammer with the handle along x and the eye at the origin. Lengths in mm."""
 
-    # From the top of the eye to the end of the handle.
+    # The distance from the top of the eye (the hole for the handle) to the end of the handle.
     length_mm: float = 330.0
-    # From the eye's middle to the striking face.
+    # The distance from the eye's middle to the striking face.
     face_reach_mm: float = 56.0
     # The thickness of the cheeks along z.
     head_thickness_mm: float = 30.0
-    # The cheeks' height along x and length along y.
+    # The cheeks' height along x and their length along y.
     cheek_height_mm: float = 32.0
     cheek_length_mm: float = 32.0
-    # Diameters of the striking face and of the neck behind it; the bevel around the face.
+    # The diameter of the striking face, the diameter of the neck behind it, and the bevel around
+    # the face.
     face_diameter_mm: float = 29.0
     neck_diameter_mm: float = 22.0
     face_bevel_mm: float = 2.0
-    # The claw: the radius and angle of its curve, the thickness and width (along z) of its tips,
-    # and the widest gap of its split.
+    # The claw's curve: its radius and angle. The claw's tips: their thickness, their width along z,
+    # and the largest gap between them.
     claw_radius_mm: float = 66.0
     claw_angle_deg: float = 60.0
     claw_tip_mm: float = 3.5
     claw_width_mm: float = 31.0
     claw_gap_mm: float = 11.0
-    # The handle's widths along y at the eye, at the throat (its thinnest point) and at the grip's
-    # swell; its thickness along z as a share of the width.
+    # The handle's widths along y at the eye, at the throat (the thinnest point) and at the swell of
+    # the grip. Then its thickness along z as a share of these widths.
     eye_width_mm: float = 25.0
     throat_width_mm: float = 23.0
     swell_width_mm: float = 34.0
     handle_flatness: float = 0.76
-    # Keys of solids.MATERIALS.
+    # Materials of the parts, keys of solids.MATERIALS.
     head_material: str = "steel"
     face_material: str = "polished_steel"
     handle_material: str = "hickory"
     grip_material: str = "painted_wood"
-    # Any other kind of hammer has two ends and a shaft, which replace the bell, the claw and the
-    # handle above; see hammer_heads.py and hammer_shafts.py. A mapping gives the fields' values.
+    # Other kinds of hammers have two ends and a shaft, each given as an object or as a mapping of
+    # its fields. They replace the face, the claw and the handle above.
     front: HeadEnd | dict[str, Any] | None = None
     back: HeadEnd | dict[str, Any] | None = None
     shaft: Shaft | dict[str, Any] | None = None
-    # Corners of the cheeks' sections: 0 is square, 1 is round.
+    # The roundness of the cheeks' corners: 0 is square, 1 is round.
     cheek_roundness: float = 0.3
 
 
@@ -72,14 +73,14 @@ def _typed(kind: type, value: Any, field: str) -> Any:
 
 
 def build_hammer(p: HammerParameters) -> list[Part]:
-    """The parts of a hammer, in mm in the design frame.
+    """Builds the parts of a hammer, in mm in the design frame.
 
     Raises:
         UserError: a mapping has an unknown field.
     """
     if p.front or p.back or p.shaft:
         return _assembled(p)
-    # The wedge spreads the handle in the eye, and protrudes a little to be visible.
+    # The wedge spreads the handle in the eye. It protrudes a little, so that it is visible.
     wedge = Manifold.cube((12.0, 0.5 * p.eye_width_mm, 2.2), True)
     wedge = wedge.translate((p.cheek_height_mm / 2 + PROUD_MM - 5.8, 0.0, 0.0))
     wood, dipped = _handle(p)
@@ -100,7 +101,7 @@ def build_hammer(p: HammerParameters) -> list[Part]:
 
 
 def _assembled(p: HammerParameters) -> list[Part]:
-    """A hammer with given ends and a given shaft."""
+    """Builds the parts of a hammer with given ends and a given shaft."""
     shaft: Shaft = _typed(Shaft, p.shaft or {}, "shaft")
     top = p.cheek_height_mm / 2 + PROUD_MM
     parts = build_shaft(shaft, top)
@@ -121,17 +122,17 @@ def _assembled(p: HammerParameters) -> list[Part]:
 
 
 def _octagon(width: float, thickness: float) -> np.ndarray:
-    """An octagonal section (n, 2) of a handle with softened corners."""
+    """Returns an octagonal section (n, 2) of a handle with softened corners."""
     return fillet(octagon_corners(width, thickness), 0.35 * (0.27 * thickness), 3)
 
 
 def _handle(p: HammerParameters) -> tuple[Shape, Shape]:
-    """The bare handle from the eye to the throat, and the dipped grip with the swell."""
+    """Builds the bare handle from the eye to the throat, and the grip with the swell."""
     top = p.cheek_height_mm / 2 + PROUD_MM
     end = top - p.length_mm
     eye, throat, swell = p.eye_width_mm, p.throat_width_mm, p.swell_width_mm
-    # (distance from the end as a share of the length, width). The flanks are parallel behind the
-    # head, where a gripper holds the handle.
+    # Pairs of a distance from the end, as a share of the length, and a width. Behind the head the
+    # flanks are parallel, because a gripper holds the handle there.
     bare = [
         (1.0, 0.86 * eye),
         (0.995, 0.9 * eye),
@@ -168,12 +169,12 @@ def _handle(p: HammerParameters) -> tuple[Shape, Shape]:
 
 
 def _across_y(profile: np.ndarray, y: float) -> np.ndarray:
-    """A section of a loft along y, with the profile's axes along x and z."""
+    """Returns a section (n, 3) of a loft along y, with the profile's axes along x and z."""
     return np.column_stack([-profile[:, 0], np.full(len(profile), y), profile[:, 1]])
 
 
 def _cheeks(p: HammerParameters) -> Shape:
-    """The block around the eye, narrowed toward poll and claw."""
+    """Builds the block around the eye, which narrows toward the face and the claw."""
     half, height, thickness = p.cheek_length_mm / 2, p.cheek_height_mm, p.head_thickness_mm
     sections = [(-1.0, 0.8), (-0.72, 1.0), (0.72, 1.0), (1.0, 0.8)]
     return loft(
@@ -185,7 +186,8 @@ def _cheeks(p: HammerParameters) -> Shape:
 
 
 def _poll(p: HammerParameters) -> tuple[Shape, Shape]:
-    """Neck and bell, and the striking face with its bevel and slight crown."""
+    """Builds the neck with the bell at its end, and the striking face with its bevel and slight
+    crown."""
     start, end, bevel = 0.4 * p.cheek_length_mm, p.face_reach_mm, p.face_bevel_mm
     neck, face = p.neck_diameter_mm, p.face_diameter_mm
     bell = end - 0.3 * face - bevel
@@ -217,13 +219,13 @@ def _poll(p: HammerParameters) -> tuple[Shape, Shape]:
 
 
 def _claw(p: HammerParameters) -> Shape:
-    """A tapered band that bends toward the handle, split at its tips."""
+    """Builds the claw: a tapered band that bends toward the handle and is split at its tips."""
     start = 0.3 * p.cheek_length_mm
     root = 0.84 * p.cheek_height_mm
     turn = np.radians(p.claw_angle_deg)
     sections = []
     for t in np.linspace(0.0, 1.0, 13):
-        # The outer edge follows the circle, and the thickness extends inward.
+        # The outer edge follows a circle, and the thickness extends inward.
         angle = -np.pi / 2 - t * turn
         thickness = p.claw_tip_mm + (root - p.claw_tip_mm) * (1 - t) ** 1.15
         width = p.head_thickness_mm * 0.8 + (p.claw_width_mm - 0.8 * p.head_thickness_mm) * min(
@@ -243,7 +245,7 @@ def _claw(p: HammerParameters) -> Shape:
 
 
 def _split(p: HammerParameters, start: float) -> Manifold:
-    """The V between the tines, seen along x, which narrows to a round root."""
+    """Builds the V-shaped gap between the tips of the claw, which narrows to a round root."""
     reach = start + p.claw_radius_mm
     root = start + 0.32 * p.claw_radius_mm
     outline = fillet(

@@ -1,7 +1,7 @@
-"""Heads of hammers: a block around the eye with an end on either side.
+"""Heads of hammers: a block around the eye, with an end on either side.
 
-The head's axis is y; a section's height is along x and its thickness along z. Ends are built toward
-+y, the side of the striking face, and the other end is flipped.
+The head's axis is y. A section's height is along x, and its thickness along z. Ends are built
+toward +y, the side of the striking face; the other end is then flipped.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,7 +21,7 @@ from kitting_drake.hkd.tools.solids import (
     rounded_rectangle,
 )
 
-# Tolerances of the hulls of a full-size head or shaft, for the outline and for heights, in mm.
+# Tolerances of the hulls of a full-size head or shaft, in mm: for the outline, and for heights.
 OUTLINE_MM, HEIGHT_MM = 0.4, 1.2
 
 
@@ -29,31 +29,35 @@ OUTLINE_MM, HEIGHT_MM = 0.4, 1.2
 class HeadEnd:
     """One end of a head. Lengths in mm of the full-size tool."""
 
-    # bell, plain, ball, wedge, point, claw or capped.
+    # The kind of end: bell, plain, ball, wedge, point, claw or capped.
     kind: str = "bell"
-    # From the eye's middle to the end.
+    # The distance from the eye's middle to the end.
     reach_mm: float = 56.0
-    # The size at the end along x (the diameter of a face), and along z (0: as along x).
+    # The size at the end along x (for a face, its diameter), and the size along z (0: the same as
+    # along x).
     size_mm: float = 29.0
     thickness_mm: float = 0.0
     # The size of the neck behind a bell or a ball, or of the root of a claw, wedge or point.
     neck_mm: float = 22.0
-    # Corners of a section: 1 is round, 0 is square; `octagonal` makes them flat.
+    # The roundness of a section's corners (1 is round, 0 is square), and whether the corners are
+    # cut off straight.
     roundness: float = 1.0
     octagonal: bool = False
-    # The drop of the tip toward the handle, and the power of the curve that it follows.
+    # The drop of the tip toward the handle, and the exponent of the curve that the drop follows.
     drop_mm: float = 0.0
     curve: float = 2.0
-    # The gap between two tines at their tips; 0 for no split.
+    # The gap between the two tips of a split end; 0 for no split.
     gap_mm: float = 0.0
     # Whether the striking face has a milled waffle pattern.
     milled: bool = False
-    # Key of solids.MATERIALS for the outermost few millimetres (a face or a plastic cap).
+    # The material of the outermost few millimetres, such as a face or a plastic cap. A key of
+    # solids.MATERIALS.
     tip_material: str = "polished_steel"
 
 
 class Section(NamedTuple):
-    """A section of a head: position along y, height along x, thickness along z, offset along x."""
+    """A section of a head in mm: position along y, height along x, thickness along z, offset along
+    x."""
 
     y: float
     height: float
@@ -63,7 +67,8 @@ class Section(NamedTuple):
 
 
 def head_loft(stations: Sequence[Section], octagonal: bool = False) -> Shape:
-    """A skin through stations; its hulls have fewer corners but nearly the same projections."""
+    """Makes a skin through sections; its hulls have fewer corners but nearly the same
+    projections."""
 
     def sections(segments: int) -> list[np.ndarray]:
         rings = []
@@ -91,7 +96,8 @@ def build_head(
     back: HeadEnd,
     material: str,
 ) -> list[Part]:
-    """The parts of a head with its eye at the origin: the tips first, then the steel body."""
+    """Builds the parts of a head with its eye at the origin: first the tips, then the steel
+    body."""
     half = cheek_length / 2
     cheeks = head_loft(
         [
@@ -110,7 +116,7 @@ def build_head(
     for name, end, flipped in (("front", front, False), ("back", back, True)):
         body, tip = ENDS[end.kind](end, *root)
         if flipped:
-            # Flip about x, so that the handle's direction stays.
+            # Flip about x, so that the handle keeps its direction.
             body, tip = body.flipped(), tip.flipped() if tip else None
         steel.append(body)
         if tip:
@@ -120,7 +126,8 @@ def build_head(
 
 
 def _bell(e: HeadEnd, height: float, thickness: float, start: float) -> tuple[Shape, Shape]:
-    """A neck that flares to a round, square or octagonal face with a bevel and a slight crown."""
+    """Builds a neck that widens to a round, square or octagonal face with a bevel and a slight
+    crown."""
     size, neck, end, r = e.size_mm, e.neck_mm, e.reach_mm, e.roundness
     deep = e.thickness_mm or size
     ratio = deep / size
@@ -138,7 +145,7 @@ def _bell(e: HeadEnd, height: float, thickness: float, start: float) -> tuple[Sh
 
 
 def _face(e: HeadEnd, start: float) -> Shape:
-    """The last millimetres of a striking end; its hulls omit the crown."""
+    """Builds the last millimetres of a striking end; its hulls omit the crown."""
     size, deep, end = e.size_mm, e.thickness_mm or e.size_mm, e.reach_mm
     rim = [
         Section(start, size, deep, e.roundness),
@@ -157,7 +164,7 @@ def _face(e: HeadEnd, start: float) -> Shape:
 
 
 def _plain(e: HeadEnd, height: float, thickness: float, start: float) -> tuple[Shape, Shape]:
-    """A block of constant section from the cheeks to the face, as on a sledge."""
+    """Builds a block of constant section from the cheeks to the face, as on a sledgehammer."""
     size, deep, r = e.size_mm, e.thickness_mm or e.size_mm, e.roundness
     body = head_loft(
         [
@@ -171,7 +178,7 @@ def _plain(e: HeadEnd, height: float, thickness: float, start: float) -> tuple[S
 
 
 def _capped(e: HeadEnd, height: float, thickness: float, start: float) -> tuple[Shape, Shape]:
-    """A steel socket and a soft cap, which is 44 % of the end's length."""
+    """Builds a steel socket and a soft cap, whose length is 44 % of the end's length."""
     size, deep = e.size_mm, e.thickness_mm or e.size_mm
     seam = e.reach_mm - 0.44 * (e.reach_mm - start)
     neck = e.neck_mm
@@ -196,7 +203,7 @@ def _capped(e: HeadEnd, height: float, thickness: float, start: float) -> tuple[
 
 
 def _ball(e: HeadEnd, height: float, thickness: float, start: float) -> tuple[Shape, Shape]:
-    """A ball on a neck."""
+    """Builds a ball on a neck."""
     radius, neck = e.size_mm / 2, e.neck_mm
     center = e.reach_mm - radius
     join = np.arcsin(0.8 * neck / e.size_mm)
@@ -211,7 +218,7 @@ def _ball(e: HeadEnd, height: float, thickness: float, start: float) -> tuple[Sh
     ball = head_loft(
         [Section(center - radius * np.cos(a), *[e.size_mm * np.sin(a)] * 2) for a in angles]
     )
-    # Fewer rings suffice for collision.
+    # Use fewer rings for the collision hulls, which need less detail.
     keep = head_loft(
         [
             Section(center - radius * np.cos(a), *[e.size_mm * np.sin(a)] * 2)
@@ -222,7 +229,10 @@ def _ball(e: HeadEnd, height: float, thickness: float, start: float) -> tuple[Sh
 
 
 def _wedge(e: HeadEnd, height: float, thickness: float, start: float) -> tuple[Shape, None]:
-    """A peen, chisel or blade: `size_mm` along x and `thickness_mm` along z at its edge."""
+    """Builds a peen, chisel or blade.
+
+    At its edge, it measures `size_mm` along x and `thickness_mm` along z.
+    """
     deep = e.thickness_mm or e.size_mm
     stations = []
     for t in np.linspace(0.0, 1.0, 9):
@@ -249,7 +259,7 @@ def _wedge(e: HeadEnd, height: float, thickness: float, start: float) -> tuple[S
 
 
 def _point(e: HeadEnd, height: float, thickness: float, start: float) -> tuple[Shape, None]:
-    """A square or round spike."""
+    """Builds a square or round spike."""
     deep = e.neck_mm
     return head_loft(
         [
@@ -263,7 +273,8 @@ def _point(e: HeadEnd, height: float, thickness: float, start: float) -> tuple[S
 
 
 def _claw(e: HeadEnd, height: float, thickness: float, start: float) -> tuple[Shape, None]:
-    """A tapered band with a split edge that bends toward the handle, with a smooth upper edge."""
+    """Builds a tapered band with a split edge, which bends toward the handle with a smooth upper
+    side."""
     root, wide = min(height, e.neck_mm), e.thickness_mm or thickness
     top = root / 2
 
@@ -281,7 +292,7 @@ def _claw(e: HeadEnd, height: float, thickness: float, start: float) -> tuple[Sh
             rings.append(across_path(profile, center, float(along)))
         return rings
 
-    # The chords of the concave inner edge lie partly outside it, so inset them.
+    # The chords of the concave inner edge lie partly outside the edge, so inset them.
     inset = min(0.4, 0.1 * e.size_mm)
     hulls = runs(sections(17, 1, inset), OUTLINE_MM + inset, HEIGHT_MM)
     solid = loft(sections(13, 4)).solid

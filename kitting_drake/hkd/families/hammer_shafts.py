@@ -1,4 +1,4 @@
-"""Handles of hammers: a shaft through the eye and a grip, along x."""
+"""Handles of hammers: a shaft through the head's eye and a grip, along x."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,7 @@ from kitting_drake.hkd.families.hammer_heads import HEIGHT_MM, OUTLINE_MM
 from kitting_drake.hkd.tools.collision import runs
 from kitting_drake.hkd.tools.solids import Part, Shape, across_x, fillet, loft, rounded_rectangle
 
-# How far the handle protrudes from the top of the eye.
+# How far the handle protrudes from the top of the eye, in mm.
 PROUD_MM = 1.4
 
 
@@ -17,30 +17,34 @@ PROUD_MM = 1.4
 class Shaft:
     """A handle. Lengths in mm of the full-size tool."""
 
-    # plain (for instance wood), ribbed (a rubber sleeve) or rings (stacked leather).
+    # The kind of handle: plain (for instance wood), ribbed (a rubber sleeve) or rings (stacked
+    # leather).
     kind: str = "plain"
     length_mm: float = 320.0
-    # Widths along y of the straight part behind the head, of the throat where the grip begins, of
-    # the grip's swell and of its end; thicknesses along z as shares of the widths.
+    # The widths along y of the straight part behind the head, of the throat where the grip begins,
+    # of the grip's swell, and of the grip's end. Then the thicknesses along z as shares of the
+    # widths.
     neck_width_mm: float = 25.0
     throat_width_mm: float = 23.0
     swell_width_mm: float = 32.0
     end_width_mm: float = 34.0
     flatness: float = 0.76
     grip_flatness: float = 0.76
-    # Where the grip begins and where its swell is, as shares of the length.
+    # The positions where the grip begins and where its swell is, as shares of the length.
     neck_share: float = 0.5
     swell_share: float = 0.72
-    # Corners of a section: 0 is square, 1 is round; `octagonal` makes them flat.
+    # The roundness of a section's corners (0 is square, 1 is round), and whether the corners are
+    # cut off straight.
     roundness: float = 0.55
     octagonal: bool = False
-    # How far the middle line bows toward the face, and how far the end bows back from there.
+    # The distance by which the middle line bows toward the face, and the distance by which the end
+    # bows back from there.
     bow_mm: float = 0.0
     # The number of grooves in the grip.
     ribs: int = 7
-    # Whether the broad sides of a one-piece steel neck have hollows.
+    # Whether the broad sides of a steel neck, made in one piece with the head, have hollows.
     fullered: bool = False
-    # Keys of solids.MATERIALS.
+    # Materials of the parts, keys of solids.MATERIALS.
     material: str = "hickory"
     grip_material: str = "hickory"
     accent_material: str = "dark_steel"
@@ -51,7 +55,7 @@ def _section(width: float, thickness: float, roundness: float, segments: int) ->
 
 
 def octagon_corners(width: float, thickness: float) -> list[tuple[float, float]]:
-    """The corners of a rectangle about the origin with cut corners."""
+    """Returns the corners of a rectangle about the origin whose corners are cut off."""
     y, z, cut = width / 2, thickness / 2, 0.27 * thickness
     return [
         (-y + cut, -z), (y - cut, -z), (y, -z + cut), (y, z - cut),
@@ -60,7 +64,7 @@ def octagon_corners(width: float, thickness: float) -> list[tuple[float, float]]
 
 
 def build_shaft(s: Shaft, top: float) -> list[Part]:
-    """The parts of a handle whose upper end is at x = `top`."""
+    """Builds the parts of a handle whose upper end is at x = `top`."""
     neck = [
         (0.0, 0.9 * s.neck_width_mm),
         (0.004, s.neck_width_mm),
@@ -79,13 +83,13 @@ def build_shaft(s: Shaft, top: float) -> list[Part]:
     parts = [Part("shaft", s.material, bare.solid, bare.hulls)]
     if s.kind == "plain":
         return [*parts, Part("grip", s.grip_material, sleeve.solid, sleeve.hulls)]
-    # The grip's hulls ignore the grooves, which are too narrow for anything to enter.
+    # The hulls of the grip ignore its grooves, which are too narrow for other objects to enter.
     first, last = grip[2][0], grip[-5][0]
     edges = np.linspace(first, last, 2 * s.ribs + 2)
     grooved = sleeve.solid
     rings = None
     for a, b in zip(edges[1::2], edges[2::2], strict=False):
-        # A groove must be narrow enough that cavities bridge it.
+        # Keep grooves so narrow that cavities bridge them.
         middle, half = 0.5 * (a + b), min(0.3 * (b - a), 1.3 / s.length_mm)
         a, b = middle - half, middle + half
         widths = np.interp([a, b], [u for u, _ in grip], [w for _, w in grip])
@@ -113,7 +117,7 @@ def build_shaft(s: Shaft, top: float) -> list[Part]:
 
 
 def _grip_stations(s: Shaft) -> list[tuple[float, float]]:
-    """The (share of the handle's length, width) pairs along the grip."""
+    """Returns (share of the handle's length, width) pairs along the grip."""
     a, swell, end = s.neck_share, s.swell_width_mm, s.end_width_mm
 
     def at(t: float) -> float:
@@ -138,7 +142,7 @@ def _grip_stations(s: Shaft) -> list[tuple[float, float]]:
 
 
 def _loft(s: Shaft, top: float, stations: list[tuple[float, float, float]]) -> Shape:
-    """A loft through (share of length, width, thickness); its hulls have fewer corners."""
+    """Makes a loft through (share of length, width, thickness); its hulls have fewer corners."""
 
     def rings(segments: int) -> list[np.ndarray]:
         result = []
@@ -156,13 +160,13 @@ def _loft(s: Shaft, top: float, stations: list[tuple[float, float, float]]) -> S
 
 
 def _bow(s: Shaft, u: float) -> float:
-    """The offset of the middle line toward the face at a share of the length."""
+    """Returns the offset of the middle line toward the face at a share `u` of the length."""
     t = max(0.0, (u - 0.36) / 0.64)
     return s.bow_mm * (np.sin(np.pi * min(1.0, 1.25 * t)) * 1.0 - 1.2 * max(0.0, t - 0.55))
 
 
 def _hollows(s: Shaft, top: float) -> Manifold:
-    """Hollows along the broad sides between head and grip."""
+    """Builds the hollows along the broad sides between head and grip."""
     start, end = 0.13 * s.length_mm, (s.neck_share - 0.015) * s.length_mm
     thickness = s.flatness * s.neck_width_mm
     half = 0.24 * s.neck_width_mm

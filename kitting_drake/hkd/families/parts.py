@@ -1,8 +1,9 @@
-"""Simple parts beside hand tools: rings, discs, plates, boards, bolts and the like.
+"""Simple parts that kits may hold besides hand tools: rings, discs, plates, boards, bolts and
+others.
 
-A part is a kind and its dimensions, such as `ring_40x20x10`: the name says all. A bare kind has
-default dimensions. Each part lies as it rests on the table, z up, with z = 0 at its bottom and the
-origin in the middle of its bounding box. Lengths are in mm.
+A part's name is its kind and its dimensions, such as `ring_40x20x10`. A kind without dimensions has
+default ones. A part's frame has z up in its resting pose, z = 0 at its bottom, and the origin in
+the middle of its bounding box. Lengths are in mm.
 """
 
 import math
@@ -24,25 +25,26 @@ from kitting_drake.hkd.tools.solids import (
 )
 
 SHORTEST_MM, LONGEST_MM = 15.0, 350.0
-"""The range of a part's length."""
+"""The shortest and the longest part."""
 THINNEST_MM = 4.0
-"""The least height of a part: the pads end 1.5 mm above the table."""
+"""The least height of a part. The pads end 1.5 mm above the table."""
 WIDEST_MM = 70.0
 """The largest width between the jaws; they open to 80 mm."""
 
 _BEVEL = 0.4
 _FRAME = 5.0
-"""The thickness of a board: bare ones of 1.6 mm are too thin for pads 1.5 mm above the table."""
+"""The thickness of a board's frame. A bare board of 1.6 mm is too thin for pads that end 1.5 mm
+above the table."""
 _SEGMENTS = 36
 _SECTORS = 12
 _ROUND = 24
-"""The order of symmetry that stands for a round part."""
+"""The order of symmetry of a round part."""
 _PAD = 17.6
 """The length of the jaws' pads."""
 _INNER_REACH = 58.0
-"""How far the open jaw's inner finger reaches from the grasp, with a margin of 3 mm."""
+"""The reach of the open jaw's inner finger from the grasp, with a margin of 3 mm."""
 _HEX = 2 / math.sqrt(3)
-"""The ratio of a hexagon's width across corners to that across flats."""
+"""The ratio of a hexagon's width across corners to its width across flats."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,7 @@ class PartGrasp:
 
 @dataclass(frozen=True)
 class PartDesign:
-    """The geometry of a part."""
+    """The geometry of a part, in mm."""
 
     parts: list[Part]
     grasp: PartGrasp
@@ -68,13 +70,16 @@ class PartDesign:
 
 
 class PartError(ValueError):
-    """The dimensions make no part that the hand can hold; the message says why."""
+    """Raised if the dimensions make no part that the hand can hold; the message says why."""
 
 
 def ring(outer: float, inner: float, height: float) -> PartDesign:
-    """A bearing or a washer. Up to 70 mm it is held across its outside, above across its rim."""
+    """Designs a bearing or a washer, in mm.
+
+    A ring of up to 70 mm is held across its outside, a larger one across its rim.
+    """
     if not 2.0 <= inner <= outer - 4.0:
-        raise PartError(f"the bore must be 2 to {outer - 4:g} mm wide, not {inner:g}")
+        raise PartError(f"the bore must be 2 to {outer - 4:g} mm wide, and is {inner:g} mm")
     big, small = outer / 2, inner / 2
     profile = CrossSection([circle(big, segments=_SEGMENTS)]) - CrossSection(
         [circle(small, segments=_SEGMENTS)]
@@ -92,14 +97,14 @@ def ring(outer: float, inner: float, height: float) -> PartDesign:
             f"a ring of more than {WIDEST_MM:g} mm is held across its rim, and a bore of {inner:g} "
             "mm leaves the finger no room"
         )
-    # The inner pad touches the bore with its two ends.
+    # The two ends of the inner pad touch the bore.
     chord = math.sqrt(small**2 - (_PAD / 2) ** 2)
     grasp = PartGrasp(big - chord, height, (big + chord) / 2, 0.0, 90.0)
     return PartDesign([Part("ring", "amber_plastic", solid, hulls)], grasp, _ROUND)
 
 
 def disc(diameter: float, height: float) -> PartDesign:
-    """A round plate, or a cylinder that stands on its end."""
+    """Designs a round plate, or a cylinder that stands on its end, in mm."""
     shape = _prism(circle(diameter / 2, segments=_SEGMENTS), height)
     return PartDesign(
         [Part("disc", "steel", shape.solid, shape.hulls)], PartGrasp(diameter, height), _ROUND
@@ -107,7 +112,7 @@ def disc(diameter: float, height: float) -> PartDesign:
 
 
 def rod(length: float, diameter: float) -> PartDesign:
-    """A cylinder that lies on its side, on one of 24 narrow flats."""
+    """Designs a cylinder that lies on its side, on one of 24 narrow flats, in mm."""
     section = circle(diameter / 2 / math.cos(math.pi / 24), segments=24)
     section = section @ _turn(math.pi / 24) + (0.0, diameter / 2)
     shape = loft([across_x(section, -length / 2), across_x(section, length / 2)])
@@ -119,7 +124,7 @@ def rod(length: float, diameter: float) -> PartDesign:
 
 
 def plate_part(length: float, width: float, height: float) -> PartDesign:
-    """A rectangular plate or block."""
+    """Designs a rectangular plate or block, in mm."""
     shape = _prism(_rectangle(length, width), height)
     return PartDesign(
         [Part("plate", _light(length), shape.solid, shape.hulls)],
@@ -129,15 +134,15 @@ def plate_part(length: float, width: float, height: float) -> PartDesign:
 
 
 def board(length: float, width: float, height: float) -> PartDesign:
-    """A circuit board in a frame of 5 mm, with parts on it that end at `height`.
+    """Designs a circuit board in a frame 5 mm high, with components up to `height`, in mm.
 
-    Its cavity is a rectangle, in which half a turn is the same placement.
+    Its cavity is a rectangle, so the board also counts as placed when it is turned by a half turn.
     """
     if height < _FRAME + 1.0:
         raise PartError(f"a board with its parts must be {_FRAME + 1:g} mm high or more")
     base = _prism(_rectangle(length, width), _FRAME)
     parts = [Part("board", "green_grip", base.solid, base.hulls)]
-    # A connector at one end, a chip and a smaller part: none of them symmetric.
+    # Add a connector at one end, a chip and a smaller component, so that the board has no symmetry.
     for number, (x, y, long, wide, share) in enumerate(
         ((0.36, 0.0, 0.16, 0.7, 1.0), (-0.15, 0.12, 0.28, 0.4, 0.45), (-0.38, -0.3, 0.1, 0.16, 0.7))
     ):
@@ -149,14 +154,14 @@ def board(length: float, width: float, height: float) -> PartDesign:
 
 
 def bolt(length: float, diameter: float) -> PartDesign:
-    """A bolt with a hexagonal head that stands on the head; `length` is its whole height.
+    """Designs a bolt that stands on its hexagonal head, in mm; `length` is the whole height.
 
     A bolt that lies on its side is a `pin`.
     """
-    # The fingertips reach 10 mm below the top, and the head stays below them.
+    # The fingertips reach 10 mm below the top. Keep the head below them.
     head = min(0.65 * diameter, length - 11.0)
     if head < 2.0:
-        raise PartError(f"a standing bolt must be 13 mm long or more, not {length:g}")
+        raise PartError(f"a standing bolt must be at least 13 mm long, and is {length:g} mm")
     hexagon = _hexagon(1.6 * diameter)
     shank = circle(diameter / 2, segments=24)
     lower, upper = _prism(hexagon, head), plate(shank, head - 0.2, length, _BEVEL, [_around(shank)])
@@ -171,7 +176,10 @@ def bolt(length: float, diameter: float) -> PartDesign:
 
 
 def pin(length: float, diameter: float) -> PartDesign:
-    """A lying pin with a square collar at one end, on which and on its shank it is level."""
+    """Designs a lying pin with a square collar at one end, in mm.
+
+    The collar is as high as the shank, so the pin lies level.
+    """
     section = circle(diameter / 2 / math.cos(math.pi / 24), segments=24)
     section = section @ _turn(math.pi / 24) + (0.0, diameter / 2)
     collar = 0.18 * length
@@ -183,13 +191,16 @@ def pin(length: float, diameter: float) -> PartDesign:
         Part("shank", "steel", shank.solid, shank.hulls),
     ]
     x = _middle_of_mass(parts)[0]
-    # The pads of a short pin touch the collar, which is wider.
+    # The pads of a short pin touch its collar, which is wider than its shank.
     on_collar = x + _PAD / 2 > length / 2 - collar
     return PartDesign(parts, PartGrasp((1.7 if on_collar else 1.0) * diameter, diameter, x), 1)
 
 
 def socket(diameter: float, height: float) -> PartDesign:
-    """A socket of a ratchet that stands on its drive: a collar, and a narrower, hexagonal mouth."""
+    """Designs a ratchet's socket that stands on its drive end, in mm.
+
+    A wide collar is at the bottom, and a narrower, hexagonal mouth at the top.
+    """
     neck = 0.55 * height
     low, high = (circle(s * diameter / 2, segments=_SEGMENTS) for s in (1.0, 0.86))
     base = plate(low, 0.0, neck, _BEVEL, [_around(low)])
@@ -206,8 +217,8 @@ def socket(diameter: float, height: float) -> PartDesign:
 
 
 def bit(length: float, flats: float) -> PartDesign:
-    """A lying screwdriver bit: a hexagonal shank and a narrower, flattened tip."""
-    # The hexagon lies on a flat, and its corners point to the jaws.
+    """Designs a lying screwdriver bit in mm: a hexagonal shank and a narrower, flattened tip."""
+    # The hexagon lies on a flat, and its corners point toward the jaws.
     section = _hexagon(flats) + (0.0, flats / 2)
     start, end = -length / 2, length / 2
     shoulder = start + 0.68 * length
@@ -223,7 +234,7 @@ def bit(length: float, flats: float) -> PartDesign:
 
 
 def bracket(length: float, width: float, height: float) -> PartDesign:
-    """An L from above: a long leg along x and a short one along y, each `width / 3` thick."""
+    """Designs an L in mm: a long leg along x and a short one along y, each `width / 3` thick."""
     thick = max(width / 3, THINNEST_MM)
     long_leg = _rectangle(length, thick) + (0.0, (thick - width) / 2)
     short_leg = _rectangle(thick, width) + ((length - thick) / 2, 0.0)
@@ -231,7 +242,7 @@ def bracket(length: float, width: float, height: float) -> PartDesign:
     cells = [CrossSection([leg]) for leg in (long_leg, short_leg)]
     shape = plate(profile, 0.0, height, _BEVEL, cells)
     parts = [Part("bracket", _light(length), shape.solid, shape.hulls)]
-    # The fingers stay beside the short leg.
+    # The fingers close beside the short leg.
     x = min(_middle_of_mass(parts)[0], length / 2 - thick - 12.0)
     if x < -length / 2:
         raise PartError("its long leg is too short for the jaws")
@@ -240,14 +251,15 @@ def bracket(length: float, width: float, height: float) -> PartDesign:
 
 @dataclass(frozen=True)
 class PartKind:
-    """A kind of part: its design, and its proportions."""
+    """A kind of part: its design function and its proportions."""
 
     design: Callable[..., PartDesign]
     dimensions: str
-    """The names of the dimensions."""
+    """The names of the dimensions, for messages."""
     default: tuple[float, ...]
     scaled: Callable[[float, float, float], tuple[float, ...]]
-    """The dimensions of a part of a length, given two numbers from 0 to 1 that vary its shape."""
+    """A function that returns the dimensions of a part of a given length. Two further numbers from
+    0 to 1 vary its shape."""
     longest: float = LONGEST_MM
     shortest: float = SHORTEST_MM
 
@@ -264,7 +276,7 @@ def _scaled_ring(length: float, u: float, v: float) -> tuple[float, ...]:
 
 
 def _height(length: float, low: float, high: float, share: float) -> float:
-    """A height in proportion to the length, but neither too thin nor too high for a kit."""
+    """Returns a height in proportion to the length, within the limits of the hand and a kit."""
     return min(max(_between(low, high, share) * length, THINNEST_MM + 1.0), 30.0)
 
 
@@ -371,7 +383,7 @@ def design_part(kind: str, dimensions: tuple[float, ...]) -> PartDesign:
 
     Args:
         kind: a key of `PART_KINDS`.
-        dimensions: in mm, in the order of `PartKind.dimensions`.
+        dimensions: the dimensions in mm, in the order of `PartKind.dimensions`.
 
     Raises:
         PartError: the dimensions do not make a part that the hand can hold.
@@ -394,24 +406,24 @@ def design_part(kind: str, dimensions: tuple[float, ...]) -> PartDesign:
 
 
 def _light(length: float) -> str:
-    """The material of a solid part: steel, or aluminium if that would be heavy."""
+    """Returns the material of a solid part: steel, or aluminium if steel would be too heavy."""
     return "red_enamel" if length > 60 else "steel"
 
 
 def _middle_of_mass(parts: list[Part]) -> np.ndarray:
-    """(3,) the centre of mass of parts, in mm."""
+    """Returns the centre of mass (3,) of parts, in mm."""
     return (
         1e3 * mass_properties([(part.solid, MATERIALS[part.material].density) for part in parts])[1]
     )
 
 
 def _prism(profile: np.ndarray, height: float) -> Shape:
-    """A bevelled prism over a convex profile."""
+    """Makes a bevelled prism over a convex profile."""
     return plate(profile, 0.0, height, min(_BEVEL, height / 5), [_around(profile)])
 
 
 def _around(profile: np.ndarray) -> CrossSection:
-    """A square that contains a profile about the origin: one hull for all of it."""
+    """Returns a square that contains a profile about the origin, so that it becomes one hull."""
     return CrossSection.square((2 * LONGEST_MM, 2 * LONGEST_MM), True)
 
 
@@ -420,20 +432,21 @@ def _rectangle(length: float, width: float) -> np.ndarray:
 
 
 def _hexagon(flats: float) -> np.ndarray:
-    """A hexagon with its first corner toward +x."""
+    """Returns a hexagon of a given width across flats, with its first corner toward +x."""
     return circle(flats * _HEX / 2, segments=6)
 
 
 def _turn(angle: float) -> np.ndarray:
-    """(2, 2) that turns row vectors counter-clockwise by an angle in radians."""
+    """Returns the matrix (2, 2) that turns row vectors counter-clockwise by an angle in radians."""
     cos, sin = math.cos(angle), math.sin(angle)
     return np.array([[cos, sin], [-sin, cos]])
 
 
 def _sectors(outer: float, inner: float) -> list[CrossSection]:
-    """Cells that divide a ring; their inner edges are chords of the bore."""
+    """Returns cells that divide a ring; their inner edges are chords of the bore."""
     angles = 2 * np.pi * np.arange(_SECTORS + 1) / _SECTORS
-    # Chords that touch the bore from outside would fill it: set the corners on the circle.
+    # Put the corners of the chords on the bore's circle. Chords that touch the bore from outside
+    # would fill it.
     unit = np.column_stack([np.cos(angles), np.sin(angles)])
     middle = np.column_stack(
         [np.cos(angles[:-1] + np.pi / _SECTORS), np.sin(angles[:-1] + np.pi / _SECTORS)]

@@ -1,4 +1,4 @@
-"""Pliers: two crossed levers on a rivet. They lie flat with the jaws toward +x."""
+"""Generates pliers: two crossed levers on a rivet. They lie flat with the jaws toward +x."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -29,38 +29,38 @@ from kitting_drake.hkd.tools.solids import (
 class PliersParameters:
     """Slip-joint pliers with slightly open jaws and the rivet at the origin. Lengths in mm."""
 
-    # From the rivet to the tip of the jaws, and to the end of the handles.
+    # The distances from the rivet to the tip of the jaws, and to the end of the handles.
     jaw_length_mm: float = 46.0
     handle_length_mm: float = 138.0
-    # Thickness of joint and jaws.
+    # The thickness of joint and jaws.
     thickness_mm: float = 12.0
-    # Width across the parallel flanks of the joint; their lengths behind and in front of the rivet.
+    # The width across the parallel flanks of the joint, and their lengths behind and in front of
+    # the rivet.
     joint_width_mm: float = 30.0
     joint_back_mm: float = 29.0
     joint_front_mm: float = 8.0
-    # Width across both closed jaws at the tip, and the opening there.
+    # The width across both closed jaws at the tip, and the opening at the tip.
     tip_width_mm: float = 15.0
     tip_gap_mm: float = 3.4
-    # Depth and pitch of the serrations of the jaws.
+    # The depth and the pitch of the serrations of the jaws.
     tooth_depth_mm: float = 1.0
     tooth_pitch_mm: float = 2.4
-    # Distance between the middle lines of the handles where they are furthest apart.
+    # The distance between the middle lines of the handles where they are farthest apart.
     handle_spread_mm: float = 43.0
-    # Width of a steel handle, and width, thickness and length of its grip.
+    # The width of a steel handle; then the width, the thickness and the length of its grip.
     handle_width_mm: float = 9.5
     grip_width_mm: float = 14.5
     grip_thickness_mm: float = 13.5
     grip_length_mm: float = 96.0
-    # Diameter of the rivet, and bevel of the steel's outer edges.
+    # The diameter of the rivet, and the bevel of the steel's outer edges.
     rivet_diameter_mm: float = 13.0
     bevel_mm: float = 0.9
-    # Keys of solids.MATERIALS.
+    # Materials of the parts, keys of solids.MATERIALS.
     steel_material: str = "steel"
     rivet_material: str = "polished_steel"
     grip_material: str = "red_grip"
-    # Any other kind of pliers has jaws and levers, or is a pair of locking pliers; these replace
-    # the fields above. See pliers_jaws.py, pliers_levers.py and pliers_locking.py. A mapping gives
-    # the fields' values.
+    # Other kinds of pliers have `jaws` and `levers`, or are `locking` pliers. Each of these is
+    # given as an object or as a mapping of its fields, and replaces the fields above.
     jaws: Jaws | dict[str, Any] | None = None
     levers: Levers | dict[str, Any] | None = None
     locking: Locking | dict[str, Any] | None = None
@@ -74,7 +74,7 @@ def _typed(kind: type, value: Any, field: str) -> Any:
 
 
 def build_pliers(p: PliersParameters) -> list[Part]:
-    """The parts of a pair of pliers, in mm in the design frame.
+    """Builds the parts of a pair of pliers, in mm in the design frame.
 
     Raises:
         UserError: a mapping has an unknown field.
@@ -100,10 +100,11 @@ def build_pliers(p: PliersParameters) -> list[Part]:
 
 
 def _handle_path(p: PliersParameters, count: int) -> np.ndarray:
-    """The middle line (count, 2) of the upper lever's handle (y < 0), from the joint to its end."""
+    """Returns the middle line (count, 2) of the upper lever's handle (y < 0), from the joint to its
+    end."""
     inner = p.joint_width_mm / 2 - p.handle_width_mm / 2
     outer = p.handle_spread_mm / 2
-    # Along the joint's flank, then outward; the ends come back a little.
+    # The handle runs along the joint's flank, then outward; at its end it comes back a little.
     shares = np.array([0.0, 0.10, 0.42, 0.72, 1.0])
     ys = np.array([inner, inner + 0.2, inner + 0.72 * (outer - inner), outer, outer - 0.8])
     t = np.linspace(0.0, 1.0, count)
@@ -113,15 +114,15 @@ def _handle_path(p: PliersParameters, count: int) -> np.ndarray:
 
 
 def _lever(p: PliersParameters) -> Shape:
-    """One lever: jaw at y > 0, upper half of the lap joint, handle at y < 0."""
+    """Builds one lever: its jaw at y > 0, the upper half of the joint, and its handle at y < 0."""
     half, z = p.joint_width_mm / 2, p.thickness_mm / 2
     jaw = plate(_jaw_profile(p), -z, z, p.bevel_mm)
     path = _handle_path(p, 25)
     handle = plate(ribbon(path, np.full(len(path), p.handle_width_mm)), -z, z, p.bevel_mm)
-    # The grip hides the rest of the handle.
+    # Leave out the part of the handle that the grip hides.
     bare = path[path[:, 0] > p.grip_length_mm - p.handle_length_mm - 6.0]
     neck = plate(ribbon(bare, np.full(len(bare), p.handle_width_mm)), -z, z, p.bevel_mm)
-    # The lap's flanks are parallel over a finger's width; its corners are rounded.
+    # The joint's flanks are parallel over the width of a finger; its corners are rounded.
     front, back = p.joint_front_mm, p.joint_back_mm
     lap_outline = fillet(
         [
@@ -137,7 +138,7 @@ def _lever(p: PliersParameters) -> Shape:
         [1, 5, 4, 4, 5, 12, 3, 3],
     )
     lap = plate(lap_outline, 0.0, z, p.bevel_mm)
-    # Make room for the other lever's lap, with some play to turn.
+    # Make room for the other lever's half of the joint, with some play to turn.
     room = CrossSection([lap_outline]).mirror((0, 1)).offset(0.25, circular_segments=SEGMENTS)
     room = room.extrude(z + 1).translate((0, 0, -z - 1))
     return Shape(
@@ -149,12 +150,13 @@ def _lever(p: PliersParameters) -> Shape:
 
 
 def _jaw_profile(p: PliersParameters) -> np.ndarray:
-    """The upper jaw: a convex back, and an edge with fine teeth, a pipe grip and a throat."""
+    """Returns the upper jaw's outline: a convex back, and an edge with fine teeth, a pipe grip and
+    a throat."""
     length, half, tip = p.jaw_length_mm, p.joint_width_mm / 2, p.tip_width_mm / 2
     start = p.joint_front_mm
 
     def gap(x: float) -> float:
-        """Half the opening at x; the jaws turn about the rivet."""
+        """Returns half the opening at x; the jaws turn about the rivet."""
         return 0.5 * p.tip_gap_mm * x / length
 
     back = [
@@ -178,19 +180,20 @@ def _jaw_profile(p: PliersParameters) -> np.ndarray:
         depth = 0.38 * radius * np.sin(angle) + (p.tooth_depth_mm if i % 2 else 0.0)
         bite.append((middle + radius * np.cos(angle), gap(middle) + depth))
     bite += [(pipe_start - 2.0, gap(pipe_start)), (start - 6.0, 0.2)]
-    # The points run clockwise over the back to the tip and return along the bite.
+    # The points run clockwise over the back to the tip, and return along the edge that bites.
     return np.array([*back, *bite])[::-1].copy()
 
 
 def _grip(p: PliersParameters) -> Shape:
-    """The dipped sleeve of the upper lever: rounded, with a thumb stop and a closed end."""
+    """Builds the dipped sleeve of the upper lever: rounded, with a thumb stop and a closed end."""
     path = _handle_path(p, 60)
-    # Extend the sleeve beyond the steel to close the handle's end.
+    # Extend the sleeve beyond the steel, so that it closes the handle's end.
     path = np.vstack([path, path[-1] + (path[-1] - path[-2]) * [[1.0], [1.6]]])
     tangent = np.gradient(path, axis=0)
     run = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
     start = run[-1] - p.grip_length_mm
-    # (share of the sleeve's length, width, thickness), the latter as shares of the grip's.
+    # Each row is a share of the sleeve's length, a share of the grip's width, and a share of its
+    # thickness.
     stations = [
         (0.0, 0.80, 0.82),
         (0.012, 1.02, 0.92),
@@ -224,7 +227,7 @@ def _grip(p: PliersParameters) -> Shape:
 
 
 def _rivet(p: PliersParameters) -> Shape:
-    """The rivet: flush below, with a low chamfered head above."""
+    """Builds the rivet: flush below, with a low chamfered head above."""
     radius, z = p.rivet_diameter_mm / 2, p.thickness_mm / 2
 
     def disc(r: float, height: float) -> np.ndarray:

@@ -1,6 +1,7 @@
 """Outlines of the upper jaw of pliers, by kind; the lower jaw is its mirror image.
 
-The points run clockwise from the joint over the back to the tip and return along the bite.
+The points of an outline run clockwise from the joint over the back to the tip, and return along the
+edge that bites.
 """
 
 from collections.abc import Callable
@@ -21,25 +22,25 @@ class Jaws:
     kind: str = "combination"
     lower_kind: str = ""
     length_mm: float = 46.0
-    # Width across both closed jaws at the tip, and the opening there.
+    # The width across both closed jaws at the tip, and the opening at the tip.
     tip_width_mm: float = 15.0
     gap_mm: float = 3.0
-    # Thickness at the tip (0: the joint's).
+    # The thickness at the tip (0: the thickness of the joint).
     tip_thickness_mm: float = 0.0
-    # Depth and pitch of the serrations.
+    # The depth and the pitch of the serrations.
     tooth_mm: float = 0.9
     pitch_mm: float = 2.2
-    # Both jaws turn by `turn_deg` where they leave the joint, and bend by `bend_deg` more toward
-    # the tip.
+    # The angles by which both jaws turn where they leave the joint, and bend further toward the
+    # tip.
     turn_deg: float = 0.0
     bend_deg: float = 0.0
 
 
 def upper_jaw(j: Jaws, start: float, half: float, kind: str = "") -> np.ndarray:
-    """The outline (n, 2) of the upper jaw, counter-clockwise.
+    """Returns the outline (n, 2) of the upper jaw, counter-clockwise.
 
-    The joint's flanks end at x = `start` and y = +-`half`. `kind` is a key of OUTLINES, and the
-    jaws' own if empty.
+    The joint's flanks end at x = `start` and y = +-`half`. `kind` is a key of OUTLINES; if it is
+    empty, the kind is that of the jaws.
     """
     back, bite = OUTLINES[kind or j.kind](j, start, half)
     root = [(start - 6.0, 0.0), (start - 6.0, half - 0.3)]
@@ -47,10 +48,10 @@ def upper_jaw(j: Jaws, start: float, half: float, kind: str = "") -> np.ndarray:
 
 
 def bent(j: Jaws, outline: np.ndarray, start: float) -> np.ndarray:
-    """An outline turned at the joint and bent along an arc from there."""
+    """Returns an outline (n, 2) that is turned at the joint and bent along an arc from there."""
     if not j.turn_deg and not j.bend_deg:
         return outline
-    # Subdivide the edges, because straight edges bend too.
+    # Subdivide the edges, because straight edges must bend as well.
     count = np.ceil(np.linalg.norm(np.roll(outline, -1, axis=0) - outline, axis=1) / 2.0)
     outline = np.vstack(
         [
@@ -59,7 +60,7 @@ def bent(j: Jaws, outline: np.ndarray, start: float) -> np.ndarray:
         ]
     )
     t = np.clip((outline[:, 0] - start) / (j.length_mm - start), 0.0, 1.2)
-    # The turn sets in gradually at the joint.
+    # Let the turn set in gradually at the joint.
     ease = np.clip((outline[:, 0] - start + 5.0) / 5.0, 0.0, 1.0)
     line = np.linspace(0.0, 1.2, 241)
     heading = np.radians(j.turn_deg + j.bend_deg * np.clip((line - 0.25) / 0.5, 0.0, 1.0))
@@ -75,12 +76,12 @@ def bent(j: Jaws, outline: np.ndarray, start: float) -> np.ndarray:
 
 
 def _opening(j: Jaws) -> Callable[[float], float]:
-    """Half the opening along x; the jaws turn about the rivet."""
+    """Returns a function of x that gives half the opening; the jaws turn about the rivet."""
     return lambda x: 0.5 * j.gap_mm * max(0.0, x) / j.length_mm
 
 
 def _teeth(j: Jaws, high: float, low: float) -> Line:
-    """Serrations from x = `high` down to `low`."""
+    """Returns the points of serrations from x = `high` down to `low`."""
     gap, bite = _opening(j), []
     for i in range(int((high - low) / j.pitch_mm)):
         x = high - i * j.pitch_mm
@@ -89,7 +90,7 @@ def _teeth(j: Jaws, high: float, low: float) -> Line:
 
 
 def _hollow(j: Jaws, high: float, low: float, depth: float, teeth: bool) -> Line:
-    """An arched hollow between x = `low` and `high`, serrated or smooth."""
+    """Returns the points of an arched hollow between x = `low` and `high`, serrated or smooth."""
     gap = _opening(j)
     middle, radius = 0.5 * (low + high), 0.5 * (high - low)
     return [
@@ -102,14 +103,14 @@ def _hollow(j: Jaws, high: float, low: float, depth: float, teeth: bool) -> Line
 
 
 def _rounded(line: Line, radii: list[float], j: Jaws) -> Line:
-    """A back with its corners rounded except at its two ends."""
+    """Rounds the corners of a jaw's back, except at its two ends."""
     end = (j.length_mm, _opening(j)(j.length_mm) + 0.3)
     soft = fillet([*line, end, (line[0][0], 0.0)], [0.0, *radii, 0.0, 0.0])
     return [(float(x), float(y)) for x, y in soft[:-1]]
 
 
 def _combination(j: Jaws, start: float, half: float) -> tuple[Line, Line]:
-    """A flat serrated tip, a pipe grip and a side cutter."""
+    """Draws a jaw with a flat serrated tip, a pipe grip and a side cutter."""
     length, tip = j.length_mm, j.tip_width_mm / 2
     back = [
         (start, half),
@@ -124,7 +125,7 @@ def _combination(j: Jaws, start: float, half: float) -> tuple[Line, Line]:
 
 
 def _linesman(j: Jaws, start: float, half: float) -> tuple[Line, Line]:
-    """A broad, square nose with flat jaws and strong side cutters."""
+    """Draws a broad, square nose with flat jaws and strong side cutters."""
     length, tip = j.length_mm, j.tip_width_mm / 2
     back = [(start, half), (length - 3.0, tip + 0.4), (length, tip - 1.8)]
     bite = _teeth(j, length - 0.8, 0.60 * length)
@@ -133,7 +134,7 @@ def _linesman(j: Jaws, start: float, half: float) -> tuple[Line, Line]:
 
 
 def _needle(j: Jaws, start: float, half: float) -> tuple[Line, Line]:
-    """A long slender nose, straight from the shoulder to the tip."""
+    """Draws a long slender nose, straight from the shoulder to the tip."""
     length, tip = j.length_mm, j.tip_width_mm / 2
     shoulder = start + 0.16 * (length - start)
     back = [(start, half), (shoulder, 0.60 * half + 0.40 * tip), (length, tip - 0.2)]
@@ -143,7 +144,7 @@ def _needle(j: Jaws, start: float, half: float) -> tuple[Line, Line]:
 
 
 def _flat(j: Jaws, start: float, half: float) -> tuple[Line, Line]:
-    """Smooth jaws with a constant taper to a square tip."""
+    """Draws smooth jaws with a constant taper to a square tip."""
     length, tip, gap = j.length_mm, j.tip_width_mm / 2, _opening(j)
     back = [(start, half), (start + 5.0, 0.9 * half), (length, tip)]
     bite = [(length - 0.5, gap(length)), (start + 2.0, gap(start)), (start, 0.3)]
@@ -151,7 +152,7 @@ def _flat(j: Jaws, start: float, half: float) -> tuple[Line, Line]:
 
 
 def _round(j: Jaws, start: float, half: float) -> tuple[Line, Line]:
-    """Two cones with a gap between them."""
+    """Draws two cones with a gap between them."""
     length, tip, gap = j.length_mm, j.tip_width_mm / 2, _opening(j)
     open_tip = gap(length)
     back = [(start, half), (start + 8.0, 0.82 * half), (length - 0.6, open_tip + tip)]
@@ -167,7 +168,8 @@ def _round(j: Jaws, start: float, half: float) -> tuple[Line, Line]:
 
 
 def _diagonal(j: Jaws, start: float, half: float) -> tuple[Line, Line]:
-    """A short round head with a cutting edge along its whole length and a hollow at the joint."""
+    """Draws a short round head with a hollow at the joint and a cutting edge along its whole
+    length."""
     length, tip = j.length_mm, j.tip_width_mm / 2
     back = [
         (start, half),
@@ -181,7 +183,7 @@ def _diagonal(j: Jaws, start: float, half: float) -> tuple[Line, Line]:
 
 
 def _circlip(j: Jaws, start: float, half: float) -> tuple[Line, Line]:
-    """Slim jaws that end in pins."""
+    """Draws slim jaws that end in pins."""
     length, pin = j.length_mm, 1.7
     open_tip = 0.5 * j.gap_mm
     neck = 0.72 * length
@@ -199,7 +201,7 @@ def _circlip(j: Jaws, start: float, half: float) -> tuple[Line, Line]:
 
 
 def _nipper(j: Jaws, start: float, half: float) -> tuple[Line, Line]:
-    """Pincers: jaws that arch apart and meet in a broad edge across the tool."""
+    """Draws pincers, whose jaws arch apart and meet in a broad edge across the tool."""
     length, wide = j.length_mm, j.tip_width_mm / 2
     span = length - start
     back = [
@@ -220,7 +222,7 @@ def _nipper(j: Jaws, start: float, half: float) -> tuple[Line, Line]:
 
 
 def _snips(j: Jaws, start: float, half: float) -> tuple[Line, Line]:
-    """Long blades, each with a straight back that tapers to a point."""
+    """Draws long blades, each with a straight back that tapers to a point."""
     length, tip, gap = j.length_mm, j.tip_width_mm / 2, _opening(j)
     back = [
         (start, half),
@@ -233,7 +235,7 @@ def _snips(j: Jaws, start: float, half: float) -> tuple[Line, Line]:
 
 
 def _stripper(j: Jaws, start: float, half: float) -> tuple[Line, Line]:
-    """Blades with a row of round holes that grow toward the joint, and a serrated nose."""
+    """Draws blades with a row of round holes that grow toward the joint, and a serrated nose."""
     length, tip = j.length_mm, j.tip_width_mm / 2
     back = [(start, half), (start + 6.0, 0.92 * half), (length - 4.0, tip + 0.5), (length, tip - 2)]
     bite = _teeth(j, length - 1.0, length - 10.0)
@@ -250,7 +252,7 @@ def _stripper(j: Jaws, start: float, half: float) -> tuple[Line, Line]:
 
 
 def _pump(j: Jaws, start: float, half: float) -> tuple[Line, Line]:
-    """Deep jaws with coarse teeth and a hollow for pipes."""
+    """Draws deep jaws with coarse teeth and a hollow for pipes."""
     length, tip, gap = j.length_mm, j.tip_width_mm / 2, _opening(j)
     back = [
         (start, half),
@@ -265,7 +267,8 @@ def _pump(j: Jaws, start: float, half: float) -> tuple[Line, Line]:
 
 
 def _poll(j: Jaws, start: float, half: float) -> tuple[Line, Line]:
-    """The hammer jaw of fencing pliers: a square poll that sticks out sideways at the tip."""
+    """Draws the hammer jaw of fencing pliers: a square striking face sticks out sideways at the
+    tip."""
     length, out = j.length_mm, j.tip_width_mm / 2
     back = [
         (start, half),
@@ -279,7 +282,7 @@ def _poll(j: Jaws, start: float, half: float) -> tuple[Line, Line]:
 
 
 def _pick(j: Jaws, start: float, half: float) -> tuple[Line, Line]:
-    """The opposite jaw of fencing pliers: a curved point for staples sticks out sideways."""
+    """Draws the other jaw of fencing pliers: a curved point for staples sticks out sideways."""
     length, out = j.length_mm, j.tip_width_mm / 2
     back = [
         (start, half),
@@ -294,7 +297,8 @@ def _pick(j: Jaws, start: float, half: float) -> tuple[Line, Line]:
 
 
 def _staple_bite(j: Jaws, start: float) -> Line:
-    """A serrated tip with a round hole for wire and a cutter behind it."""
+    """Returns the edge of fencing pliers: a serrated tip, a round hole for wire, and a cutter
+    behind it."""
     length = j.length_mm
     bite = _teeth(j, length - 1.0, 0.66 * length)
     bite += _hollow(j, 0.62 * length, 0.46 * length, 2.4, False)

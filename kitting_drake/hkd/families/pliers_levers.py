@@ -1,4 +1,4 @@
-"""Pliers with any jaws: two crossed levers, a joint with parallel flanks, sleeved handles."""
+"""Pliers with any jaws: two crossed levers, a joint with parallel flanks, and sleeved handles."""
 
 import itertools
 from collections.abc import Sequence
@@ -23,56 +23,57 @@ from kitting_drake.hkd.tools.solids import (
     without_holes,
 )
 
-# Tolerances of the hulls of full-size pliers for the outline and for heights. The hulls of a sleeve
-# are inset, because chords stick out of its concave side.
+# Tolerances of the hulls of full-size pliers, in mm: for the outline, and for heights. Then the
+# inset of the hulls of a sleeve, because chords stick out of the sleeve's concave side.
 _OUTLINE_MM, _HEIGHT_MM, _INSET_MM = 0.22, 1.0, 0.08
 
 
 @dataclass
 class Levers:
-    """Joint and handles. Lengths in mm of the full-size tool with the rivet at the origin."""
+    """The joint and the handles. Lengths in mm of the full-size tool with the rivet at the
+    origin."""
 
     thickness_mm: float = 12.0
-    # Width across the parallel flanks of the joint; lengths of the joint behind and in front of the
-    # rivet.
+    # The width across the parallel flanks of the joint, and the lengths of the joint behind and in
+    # front of the rivet.
     joint_width_mm: float = 28.0
     joint_back_mm: float = 22.0
-    # How far behind the rivet the handles continue in line with the flanks.
+    # The distance behind the rivet up to which the handles continue in line with the flanks.
     parallel_mm: float = 44.0
     joint_front_mm: float = 9.0
-    # From the rivet to the end of the handles.
+    # The distance from the rivet to the end of the handles.
     handle_length_mm: float = 130.0
-    # Distances between the middle lines of the handles at the shoulder and at the ends; position of
-    # the shoulder as a share of a handle's length.
+    # The distances between the middle lines of the handles at the shoulder and at the ends. Then
+    # the position of the shoulder as a share of a handle's length.
     spread_mm: float = 42.0
     end_spread_mm: float = 44.0
     shoulder_share: float = 0.4
-    # Radius of the bend at the shoulder.
+    # The radius of the bend at the shoulder.
     bend_radius_mm: float = 28.0
     handle_width_mm: float = 9.0
-    # Width, thickness and length of a sleeve (length 0: no sleeve); a guard is a flare at its
-    # front.
+    # The width, the thickness and the length of a sleeve (length 0: no sleeve), and whether the
+    # sleeve widens at its front.
     grip_width_mm: float = 13.0
     grip_thickness_mm: float = 13.0
     grip_length_mm: float = 90.0
     guard: bool = False
     rivet_diameter_mm: float = 12.0
     bevel_mm: float = 0.8
-    # The number of curved grooves in the joint (tongue and groove), and a leaf spring.
+    # The number of curved grooves in the joint, and whether there is a leaf spring.
     grooves: int = 0
     spring: bool = False
-    # Keys of solids.MATERIALS.
+    # Materials of the parts, keys of solids.MATERIALS.
     steel_material: str = "steel"
     rivet_material: str = "polished_steel"
     grip_material: str = "red_grip"
 
 
 def build_levers(v: Levers, j: Jaws) -> list[Part]:
-    """The parts of a pair of pliers."""
+    """Builds the parts of a pair of pliers, in mm in the design frame."""
     upper, lower = _lever(v, j, True), _lever(v, j, False)
     steel = Part("steel", v.steel_material, upper + lower, _steel_hulls(v, j))
     rivet = _rivet(v)
-    # The rivet's head touches nothing where the sleeves are higher.
+    # The rivet's head needs no hull where the sleeves are higher.
     hidden = v.grip_length_mm and v.grip_thickness_mm > v.thickness_mm + 2.6
     parts = [Part("rivet", v.rivet_material, rivet.solid, [] if hidden else rivet.hulls), steel]
     if v.grip_length_mm:
@@ -85,7 +86,7 @@ def build_levers(v: Levers, j: Jaws) -> list[Part]:
 
 
 def handle_path(v: Levers) -> np.ndarray:
-    """The middle line (n, 2) of the handle at y < 0, from inside the joint to its end."""
+    """Returns the middle line (n, 2) of the handle at y < 0, from inside the joint to its end."""
     start = (-0.45 * v.joint_back_mm, -0.5 * (v.joint_width_mm - v.handle_width_mm))
     shoulder_x = -v.parallel_mm - v.shoulder_share * (v.handle_length_mm - v.parallel_mm)
     corners = [
@@ -94,25 +95,26 @@ def handle_path(v: Levers) -> np.ndarray:
         (shoulder_x, -v.spread_mm / 2),
         (-v.handle_length_mm, -v.end_spread_mm / 2),
     ]
-    # Close the polygon far away, so that the line's two ends are not rounded.
+    # Close the polygon far away, so that the two ends of the line are not rounded.
     far = [(-v.handle_length_mm, -400.0), (start[0], -400.0)]
     return fillet([*corners, *far], [0, 8.0, v.bend_radius_mm, 0, 0, 0], 6)[:-2]
 
 
 def _even(path: np.ndarray, step: float) -> np.ndarray:
-    """A path resampled at roughly equal steps."""
+    """Resamples a path (n, 2) at roughly equal steps."""
     run = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
     s = np.linspace(0.0, run[-1], max(2, int(run[-1] / step)))
     return np.column_stack([np.interp(s, run, path[:, k]) for k in (0, 1)])
 
 
 def _band(v: Levers, bare_only: bool) -> np.ndarray:
-    """The outline of the steel handle at y < 0, the whole or only the part outside the sleeve."""
+    """Returns the outline of the steel handle at y < 0: the whole, or only the part outside the
+    sleeve."""
     path = _even(handle_path(v), 4.0)
     if bare_only and v.grip_length_mm:
         path = path[path[:, 0] > v.grip_length_mm - v.handle_length_mm - 9.0]
     if not v.grip_length_mm:
-        # A bare handle swells toward its end.
+        # A bare handle widens toward its end.
         run = np.linspace(0.0, 1.0, len(path))
         swell = np.interp(run, [0.0, 0.4, 0.55, 0.97, 1.0], [1.0, 1.0, 1.25, 1.25, 0.9])
         return ribbon(path, v.handle_width_mm * swell)
@@ -120,7 +122,7 @@ def _band(v: Levers, bare_only: bool) -> np.ndarray:
 
 
 def _lap_outline(v: Levers) -> np.ndarray:
-    """The outline of the lap of the lever whose handle is at y < 0."""
+    """Returns the outline of the joint's half that belongs to the handle at y < 0."""
     half, front, back = v.joint_width_mm / 2, v.joint_front_mm, v.joint_back_mm
     return fillet(
         [
@@ -138,7 +140,7 @@ def _lap_outline(v: Levers) -> np.ndarray:
 
 
 def _jaw_outlines(v: Levers, j: Jaws) -> tuple[np.ndarray, np.ndarray]:
-    """The outlines of the upper and lower jaw, turned and bent."""
+    """Returns the outlines of the upper and the lower jaw, turned and bent."""
     outline = upper_jaw(j, v.joint_front_mm, v.joint_width_mm / 2)
     other = upper_jaw(j, v.joint_front_mm, v.joint_width_mm / 2, j.lower_kind)
     mirrored = (other * np.array([1.0, -1.0]))[::-1]
@@ -147,7 +149,7 @@ def _jaw_outlines(v: Levers, j: Jaws) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _tapered(solid: Manifold, v: Levers, j: Jaws) -> Manifold:
-    """Thins jaws toward the tip, symmetrically from above and below."""
+    """Makes the jaws thinner toward the tip, equally from above and below."""
     if not j.tip_thickness_mm:
         return solid
     thick, thin = v.thickness_mm / 2, j.tip_thickness_mm / 2
@@ -160,7 +162,7 @@ def _tapered(solid: Manifold, v: Levers, j: Jaws) -> Manifold:
 
 
 def _lever(v: Levers, j: Jaws, upper: bool) -> Manifold:
-    """One lever: a jaw, its half of the lap joint and its handle on the other side."""
+    """Builds one lever: a jaw, its half of the joint, and its handle on the other side."""
     z = v.thickness_mm / 2
     outline = _jaw_outlines(v, j)[0 if upper else 1]
     jaw = _tapered(plate(outline, -z, z, v.bevel_mm).solid, v, j)
@@ -168,7 +170,7 @@ def _lever(v: Levers, j: Jaws, upper: bool) -> Manifold:
         jaw -= _edge_bevel(v, j)
     band = plate(_band(v, True), -z, z, v.bevel_mm).solid
     if v.grip_length_mm:
-        # The tang inside the sleeve.
+        # Add the end of the handle that lies inside the sleeve.
         tang = plate(_band(v, False), -0.45 * z, 0.45 * z, 0.3).solid
         band += tang
     lap = plate(_lap_outline(v), 0.0, z, v.bevel_mm).solid
@@ -183,7 +185,7 @@ def _lever(v: Levers, j: Jaws, upper: bool) -> Manifold:
 
 
 def _groove(v: Levers, radius: float) -> Manifold:
-    """A curved channel in the top of the joint, about a point in front of the rivet."""
+    """Builds a curved channel in the top of the joint, about a point in front of the rivet."""
     ring = CrossSection([circle(radius + 1.1)]) - CrossSection([circle(radius - 1.1)])
     shape = ring.translate((v.joint_front_mm + 4.0, 0.35 * v.joint_width_mm))
     window = CrossSection([_lap_outline(v)]).offset(-2.0, JoinType.Miter)
@@ -191,12 +193,12 @@ def _groove(v: Levers, radius: float) -> Manifold:
 
 
 def _edge_bevel(v: Levers, j: Jaws) -> Manifold:
-    """The V-shaped bevel of cutting edges, above and below."""
+    """Builds the V-shaped bevel of cutting edges, above and below."""
     length, z = j.length_mm, v.thickness_mm / 2
     wide = {"diagonal": 0.30 * v.joint_width_mm, "snips": 4.0, "nipper": 5.0}[j.kind]
     start = v.joint_front_mm + (8.0 if j.kind != "nipper" else 0.0)
     if j.kind == "nipper":
-        # Its edge is across the tool: bevel the front.
+        # The cutting edge runs across the tool, so bevel its front.
         flat = [(length - 5.0, z + 0.1), (length + 5.0, z + 0.1), (length + 5.0, -0.2 * z)]
         rings = [np.array([(x, y, h) for x, h in flat]) for y in (-40.0, 40.0)]
     else:
@@ -209,7 +211,7 @@ def _edge_bevel(v: Levers, j: Jaws) -> Manifold:
 
 
 def _steel_hulls(v: Levers, j: Jaws) -> list[np.ndarray]:
-    """Few convex prisms that fill the steel and its small gaps."""
+    """Returns few convex prisms that fill the steel and its small gaps."""
     z = v.thickness_mm / 2
     band, lap = _band(v, True), _lap_outline(v)
     outlines = [
@@ -236,11 +238,19 @@ def slab_hulls(
     flanks: Sequence[tuple[float, float, float]] = (),
     tolerance: float = 0.24,
 ) -> list[np.ndarray]:
-    """Few convex prisms for a plate with a bevelled lower rim; holes and gaps are filled.
+    """Returns few convex prisms for a plate with a bevelled lower rim; holes and gaps are filled.
 
     The profile is cut across x into bands, each as long as possible. The hulls of a band's pieces
-    may exceed the profile by the tolerance (mm), but only by 0.05 mm at the gripped flanks
-    (x start, x end, y).
+    may exceed the profile by the tolerance.
+
+    Args:
+        profile: the outline of the plate, in mm.
+        z_low: the lower face, in mm.
+        z_high: the upper face, in mm.
+        bevel: the bevel of the lower rim, in mm.
+        flanks: (x start, x end, y) of the gripped flanks, which the hulls exceed by at most 0.05
+            mm.
+        tolerance: the largest distance of a hull outside the profile, in mm.
     """
 
     def grown(p: CrossSection, d: float) -> CrossSection:
@@ -287,7 +297,7 @@ def slab_hulls(
 
 
 def _sleeve(v: Levers) -> Shape:
-    """The dipped sleeve of the handle at y < 0: rounded, with a closed end."""
+    """Builds the dipped sleeve of the handle at y < 0: rounded, with a closed end."""
     path = _even(handle_path(v), 2.0)
     path = np.vstack([path, path[-1] + (path[-1] - path[-2]) * [[1.0], [1.6]]])
     run = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
@@ -318,7 +328,7 @@ def _sleeve(v: Levers) -> Shape:
 
 
 def _rivet(v: Levers) -> Shape:
-    """The rivet: flush below, with a low chamfered head and a dimple above."""
+    """Builds the rivet: flush below, with a low chamfered head and a dimple above."""
     radius, z = v.rivet_diameter_mm / 2, v.thickness_mm / 2
 
     def disc(r: float, height: float, segments: int) -> np.ndarray:
@@ -333,7 +343,7 @@ def _rivet(v: Levers) -> Shape:
 
 
 def _leaf(v: Levers) -> np.ndarray:
-    """The outline of a bowed leaf spring between the handles, behind the joint."""
+    """Returns the outline of a bowed leaf spring between the handles, behind the joint."""
     ends = 0.5 * (v.joint_width_mm - v.handle_width_mm)
     t = np.linspace(-1.0, 1.0, 21)
     x = -v.joint_back_mm - 2.0 - 9.0 * (1 - t**2)

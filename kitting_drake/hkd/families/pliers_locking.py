@@ -1,4 +1,4 @@
-"""Locking pliers: a channel body with an adjusting screw, a toggle handle and a release lever."""
+"""Locking pliers: a body with an adjusting screw, a toggle handle and a release lever."""
 
 from dataclasses import dataclass
 
@@ -23,17 +23,19 @@ from kitting_drake.hkd.tools.solids import (
 class Locking:
     """Locking pliers with the jaw's pivot near the origin. Lengths in mm of the full-size tool."""
 
-    # From the pivot to the tip of the jaws, and to the end of the body without the screw.
+    # The distances from the pivot to the tip of the jaws, and to the end of the body without the
+    # screw.
     jaw_length_mm: float = 46.0
     body_length_mm: float = 150.0
-    # Thickness of the channel and of the jaws; width across the parallel flanks behind the pivot.
+    # The thickness of the body, the thickness of the jaws, and the width across the parallel flanks
+    # behind the pivot.
     thickness_mm: float = 15.0
     jaw_thickness_mm: float = 11.0
     flank_width_mm: float = 38.0
-    # Depths of the body's channel and of the handle, seen from above.
+    # The depths of the body and of the handle, as seen from above.
     body_depth_mm: float = 15.0
     handle_depth_mm: float = 12.0
-    # Distance of the handle's outer edge from the body's at the end.
+    # The distance of the handle's outer edge from the body's at the end of the tool.
     spread_mm: float = 52.0
     screw_diameter_mm: float = 13.0
     body_material: str = "polished_steel"
@@ -111,7 +113,7 @@ def _outlines(k: Locking) -> dict[str, np.ndarray]:
 
 
 def build_locking(k: Locking) -> list[Part]:
-    """The parts of locking pliers, in mm in the design frame; the body at y > 0."""
+    """Builds the parts of locking pliers, in mm in the design frame; the body is at y > 0."""
     z, zj, half = k.thickness_mm / 2, k.jaw_thickness_mm / 2, k.flank_width_mm / 2
     outlines = _outlines(k)
 
@@ -136,7 +138,7 @@ def build_locking(k: Locking) -> list[Part]:
         )
     ]
 
-    # All flat parts but the jaws share the hulls of one slab, which is as thick as the body.
+    # All flat parts but the jaws share the hulls of one plate, which is as thick as the body.
     def together(*names: str) -> CrossSection:
         profiles = [
             CrossSection([outlines[name]]) + CrossSection([outlines[name][::-1]]) for name in names
@@ -158,7 +160,7 @@ def build_locking(k: Locking) -> list[Part]:
 
 
 def _jaw(back: list[tuple[float, float]], tip: float, gap: float, half: float) -> np.ndarray:
-    """The outline of a curved jaw with coarse teeth, clockwise over its back."""
+    """Returns the outline (n, 2) of a curved jaw with coarse teeth, clockwise over its back."""
     soft = fillet([*back, (tip, gap / 2), (back[0][0], 0.0)], [4, 14, 8, 2, 0, 0])
     bite = []
     for i, x in enumerate(np.linspace(tip - 0.5, 14.0, 17)):
@@ -168,7 +170,7 @@ def _jaw(back: list[tuple[float, float]], tip: float, gap: float, half: float) -
 
 
 def _screw(k: Locking, end: float, y: float) -> tuple[Shape, Shape]:
-    """The adjusting screw behind the body: a thread and a knurled knob."""
+    """Builds the adjusting screw behind the body: a thread and a knurled knob."""
     radius = k.screw_diameter_mm / 2
 
     def revolved(stations: list[tuple[float, float]], segments: int) -> list[np.ndarray]:

@@ -1,4 +1,4 @@
-"""Screwdrivers: a steel blade in a moulded handle with flats and flutes."""
+"""Generates screwdrivers: a steel blade in a moulded handle with flats and flutes."""
 
 from dataclasses import dataclass
 
@@ -21,42 +21,44 @@ from kitting_drake.hkd.tools.solids import (
 class ScrewdriverParameters:
     """A screwdriver with its tip toward +x and the handle's front at x = 0. Lengths in mm."""
 
-    # fluted (as below), a key of screwdriver_handles.STYLES, tee (a bar across the end) or offset
-    # (a bar with an angled tip at each end, without handle).
+    # The kind of handle: fluted (as described below), a key of screwdriver_handles.STYLES, tee (a
+    # bar across the end) or offset (a bar with an angled tip at each end, without a handle).
     handle: str = "fluted"
-    # flat, phillips, square, torx, hex or socket (a nut driver).
+    # The kind of tip: flat, phillips, square, torx, hex or socket (a nut driver).
     tip: str = "flat"
-    # The round shaft: length from the handle's front to the tip, and diameter.
+    # The round shaft's length from the handle's front to the tip, and its diameter.
     shaft_length_mm: float = 88.0
     shaft_diameter_mm: float = 6.5
-    # The flat tip: length, width where it flares, and thickness at the edge.
+    # The flat tip's length, its width where it is widest, and its thickness at the edge.
     tip_length_mm: float = 16.0
     tip_width_mm: float = 8.0
     tip_thickness_mm: float = 1.2
-    # The hexagonal bolster on the shaft: width across flats and length; length 0 for none.
+    # The width across flats and the length of the hexagon on the shaft; length 0 for none.
     bolster_width_mm: float = 11.0
     bolster_length_mm: float = 9.0
-    # The handle: length, width across its flats, and the reduction of the width at the neck behind
-    # the guard.
+    # The handle's length, its width across its flats, and by how much it is narrower at the neck
+    # behind the guard.
     handle_length_mm: float = 105.0
     handle_width_mm: float = 28.0
     neck_depth_mm: float = 3.5
-    # Depth of the four flutes between the flats, and radius of the corners that they cut.
+    # The depth of the four flutes between the flats, and the radius of the corners that the flutes
+    # cut.
     flute_depth_mm: float = 3.0
     corner_radius_mm: float = 10.5
-    # Height of the handle; None: its width.
+    # The height of the handle; None: the same as its width.
     handle_height_mm: float | None = None
-    # Diameter of a coloured sleeve on the shaft (0 for none), and the length that it leaves bare.
+    # The diameter of a coloured sleeve on the shaft (0 for none), and the length of the shaft that
+    # it leaves bare.
     sleeve_diameter_mm: float = 0.0
     bare_mm: float = 25.0
-    # Keys of solids.MATERIALS.
+    # Materials of the parts, keys of solids.MATERIALS.
     handle_material: str = "red_grip"
     accent_material: str = "black_rubber"
     shaft_material: str = "polished_steel"
 
 
 def build_screwdriver(p: ScrewdriverParameters) -> list[Part]:
-    """The parts of a screwdriver, in mm in the design frame.
+    """Builds the parts of a screwdriver, in mm in the design frame.
 
     Raises:
         ValueError: the handle or the tip is not known.
@@ -83,7 +85,7 @@ def build_screwdriver(p: ScrewdriverParameters) -> list[Part]:
 
 
 def _shaft_parts(p: ScrewdriverParameters) -> list[Part]:
-    """The blade and its optional sleeve."""
+    """Builds the blade and its optional sleeve."""
     if p.tip == "flat":
         shaft = _shaft(p)
     elif p.tip in TIPS:
@@ -106,9 +108,9 @@ def _shaft_parts(p: ScrewdriverParameters) -> list[Part]:
 
 
 def _tee(p: ScrewdriverParameters, height: float) -> list[tuple[str, Shape]]:
-    """A bar across the end of the shaft, flat above and below, and the hub around the shaft.
+    """Builds a bar across the end of the shaft, flat above and below, and the hub around the shaft.
 
-    The handle's width is the bar's length, and the handle's length is the hub's.
+    The handle's width is the length of the bar, and the handle's length is that of the hub.
     """
     depth = 0.36 * p.handle_width_mm
     sections = []
@@ -136,13 +138,13 @@ def _tee(p: ScrewdriverParameters, height: float) -> list[tuple[str, Shape]]:
 
 
 def _offset_driver(p: ScrewdriverParameters) -> list[Part]:
-    """A square bar whose ends bend to opposite sides and are ground to flat tips."""
+    """Builds a square bar whose ends bend to opposite sides and are ground to flat tips."""
     half, size = p.shaft_length_mm / 2, p.shaft_diameter_mm
     reach = p.tip_length_mm
     parts = []
     bar = rounded_rectangle(size, size, 0.16 * size, 2)
     for side in (1, -1):
-        # From the middle of the bar around the bend to the tip.
+        # The points run from the middle of the bar around the bend to the tip.
         bend = np.radians(np.linspace(0.0, 90.0, 5))
         radius = 0.9 * size
         turn = np.column_stack(
@@ -151,7 +153,8 @@ def _offset_driver(p: ScrewdriverParameters) -> list[Part]:
         path = [((0.0, 0.0), 0.0), *((tuple(q), a) for q, a in zip(turn, bend, strict=True))]
         sections = [across_path(bar, point, angle) for point, angle in path]
         for share, width, thick in ((0.3, 1.0, 0.7), (0.85, 1.0, 0.22), (1.0, 1.0, 0.18)):
-            # One tip is upright, the other flat, to alternate them every quarter turn.
+            # One tip is upright and the other flat, as on real tools, whose tips are used
+            # alternately.
             profile = bar * ((thick, width) if side > 0 else (width, thick))
             sections.append(
                 across_path(profile, (half, radius + share * (reach - radius)), bend[-1])
@@ -173,13 +176,14 @@ def _offset_driver(p: ScrewdriverParameters) -> list[Part]:
 
 
 def _shaft(p: ScrewdriverParameters) -> Shape:
-    """Tang, round shaft and flat tip: flared, then ground to a blunt edge."""
+    """Builds the hidden end in the handle, the round shaft and the flat tip, which widens and is
+    then ground to a blunt edge."""
     radius, end = p.shaft_diameter_mm / 2, p.shaft_length_mm
     start = end - p.tip_length_mm
     round_section = circle(radius, segments=24)
     sections = [across_x(round_section, -0.55 * p.handle_length_mm), across_x(round_section, start)]
     for t in (0.25, 0.5, 0.75, 1.0):
-        # The width grows fast and stays; the thickness decreases linearly.
+        # The width quickly reaches its maximum and stays there; the thickness decreases linearly.
         width = radius + (p.tip_width_mm / 2 - radius) * min(1.0, 2 * t)
         thickness = radius + (p.tip_thickness_mm / 2 - radius) * t
         box = np.clip(1.35 * round_section / radius, -1.0, 1.0) * (width, thickness)
@@ -188,7 +192,7 @@ def _shaft(p: ScrewdriverParameters) -> Shape:
 
 
 def _bolster(p: ScrewdriverParameters) -> Shape:
-    """A hexagon on the shaft for a wrench, with chamfered ends."""
+    """Builds a hexagon on the shaft for a wrench, with chamfered ends."""
     hexagon = circle(p.bolster_width_mm / np.sqrt(3), segments=6)
     front = p.bolster_length_mm
     return loft(
@@ -200,20 +204,22 @@ def _bolster(p: ScrewdriverParameters) -> Shape:
 
 
 def _handle_section(p: ScrewdriverParameters, x: float, width: float, flute: float) -> np.ndarray:
-    """A square (n, 3) with round corners and a flute of depth `flute` in each corner."""
+    """Returns a square section (n, 3) with round corners and a flute of depth `flute` in each
+    corner."""
     profile = rounded_rectangle(width, width, p.corner_radius_mm * width / p.handle_width_mm, 8)
     angle = np.arctan2(profile[:, 1], profile[:, 0])
-    # -cos(4 angle) is 1 on the diagonals, where the corners are. Squaring it narrows the flutes, so
-    # that they leave the flat sides alone.
+    # -cos(4 angle) is 1 on the diagonals, where the corners are. Its square is a narrower peak, so
+    # that the flutes do not cut into the flat sides.
     depth = flute * np.clip(-np.cos(4 * angle), 0.0, 1.0) ** 2
     reach = np.linalg.norm(profile, axis=1, keepdims=True)
     return across_x(profile * (1 - depth[:, None] / reach), x)
 
 
 def _handle(p: ScrewdriverParameters) -> tuple[Shape, Shape]:
-    """The fluted grip, and the smooth dark collar with a guard at its front."""
+    """Builds the fluted grip, and the smooth dark collar with a guard at its front."""
     length, width, neck = p.handle_length_mm, p.handle_width_mm, p.handle_width_mm - p.neck_depth_mm
-    # (share of the length from the butt, width, share of the flutes' depth).
+    # Each row is a share of the length from the rear end, a width, and a share of the flutes'
+    # depth.
     stations = [
         (0.0, 0.55 * width, 0.0),
         (0.012, 0.72 * width, 0.0),

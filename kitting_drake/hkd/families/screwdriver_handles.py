@@ -1,4 +1,4 @@
-"""Handles of screwdrivers: lofts through sections at stations along the length.
+"""Handles of screwdrivers: lofts through sections along the length.
 
 Every section is flat below and on both sides, so that a handle does not roll and can be gripped.
 """
@@ -15,27 +15,28 @@ from kitting_drake.hkd.tools.solids import Shape, across_x, fillet, loft, rounde
 class HandleSection(NamedTuple):
     """A section of a handle."""
 
-    # Position as a share of the handle's length: 0 at the butt, 1 at the front.
+    # The position as a share of the handle's length: 0 at the rear end, 1 at the front.
     place: float
-    # Size as a share of the handle's width and height.
+    # The size as a share of the handle's width and height.
     size: float
-    # Share of the flutes' depth.
+    # The depth of the flutes as a share of the handle's full depth of flutes.
     flute: float = 0.0
 
 
 class Zone(NamedTuple):
-    """A stretch of a handle in one material: `grip`, `accent` or `metal`."""
+    """A length of a handle of one material: `grip`, `accent` or `metal`."""
 
     material: str
     stations: Sequence[HandleSection]
-    # Whether its only detail is fine rings, which the hulls can ignore.
+    # Whether it is smooth except for fine rings, which the hulls can ignore.
     knurled: bool = False
 
 
 class Style(NamedTuple):
     """The style of a handle."""
 
-    # From width, height and flute depth to the profile (n, 2), always with the same n.
+    # A function of width, height and flute depth that returns the profile (n, 2), always with the
+    # same n.
     section: Callable[[float, float, float], np.ndarray]
     zones: Sequence[Zone]
 
@@ -43,7 +44,7 @@ class Style(NamedTuple):
 def _pressed(
     profile: np.ndarray, flutes: int, depth: float, phase: float, sharpness: float
 ) -> np.ndarray:
-    """A profile with `flutes` grooves pressed in, the first at angle `phase`."""
+    """Presses `flutes` grooves into a profile (n, 2), the first at angle `phase`."""
     angle = np.arctan2(profile[:, 1], profile[:, 0])
     press = depth * np.clip(np.cos(flutes * (angle - phase)), 0.0, 1.0) ** sharpness
     reach = np.linalg.norm(profile, axis=1)
@@ -51,7 +52,7 @@ def _pressed(
 
 
 def _resampled(profile: np.ndarray, count: int) -> np.ndarray:
-    """The points (count, 2) of a profile at equal angles about the origin."""
+    """Returns the points (count, 2) of a profile at equal angles about the origin."""
     closed = np.vstack([profile, profile[:1]])
     fine = np.vstack([a + t * (b - a) for a, b in itertools.pairwise(closed) for t in _FINE])
     angle = np.arctan2(fine[:, 1], fine[:, 0])
@@ -66,13 +67,13 @@ _FINE = np.linspace(0.0, 1.0, 24, endpoint=False)
 
 
 def _square(width: float, height: float, flute: float) -> np.ndarray:
-    """A square with large round corners and a flute along each."""
+    """Returns a square with large round corners and a flute along each corner."""
     profile = rounded_rectangle(width, height, 0.3 * min(width, height), 3)
     return _pressed(profile, 4, flute, np.pi / 4, 2)
 
 
 def _octagon(width: float, height: float, flute: float) -> np.ndarray:
-    """An octagon, as of planed wood."""
+    """Returns an octagon, as of planed wood."""
     y, z = width / 2, height / 2
     a, b = 0.42 * y, 0.42 * z
     corners = [(-a, -z), (a, -z), (y, -b), (y, b), (a, z), (-a, z), (-y, b), (-y, -b)]
@@ -80,14 +81,16 @@ def _octagon(width: float, height: float, flute: float) -> np.ndarray:
 
 
 def _ribbed(width: float, height: float, flute: float) -> np.ndarray:
-    """Eight ribs with round flutes between them; the lower and side ribs are flat."""
+    """Returns a section with eight ribs and round flutes between them; the lower and side ribs are
+    flat."""
     y, z = width / 2, height / 2
     profile = _resampled(rounded_rectangle(width, height, 0.7 * min(y, z), 8), 64)
     return _pressed(profile, 8, flute, np.pi / 8, 1)
 
 
 def _three_lobed(width: float, height: float, flute: float) -> np.ndarray:
-    """A triangle with large round corners, one side down and the lower corners cut upright."""
+    """Returns a triangle with large round corners, one side down; its lower corners are cut off
+    vertically."""
     y, z = width / 2, height / 2
     corners = [
         (-0.62 * y, -z),
@@ -103,14 +106,14 @@ def _three_lobed(width: float, height: float, flute: float) -> np.ndarray:
 
 
 def _oval(width: float, height: float, flute: float) -> np.ndarray:
-    """An oval with narrow flats above, below and at the sides."""
+    """Returns an oval with narrow flats above, below and at the sides."""
     y, z = width / 2, height / 2
     return rounded_rectangle(width, height, 0.75 * min(y, z), 3)
 
 
 S = HandleSection
 STYLES: dict[str, Style] = {
-    # Soft sides on a hard core, with a waist for the fingertips and a guard in front of it.
+    # A hard core with soft sides, a waist for the fingertips, and a guard in front of the waist.
     "two_tone": Style(
         _square,
         [
@@ -123,7 +126,7 @@ STYLES: dict[str, Style] = {
             Zone("grip", [S(0.94, 1.0), S(0.975, 1.0), S(1.0, 0.7)]),
         ],
     ),
-    # Clear plastic with ribs and a smooth bulb at the butt.
+    # Clear plastic with ribs, and a smooth bulb at the rear end.
     "ribbed": Style(
         _ribbed,
         [
@@ -141,7 +144,7 @@ STYLES: dict[str, Style] = {
             Zone("accent", [S(0.98, 1.0), S(1.0, 0.7)]),
         ],
     ),
-    # Planed wood with a swell for the palm and a ferrule.
+    # Planed wood with a swell for the palm, and a metal ferrule at the front.
     "wood": Style(
         _octagon,
         [
@@ -150,7 +153,7 @@ STYLES: dict[str, Style] = {
             Zone("metal", [S(0.92, 0.64), S(0.985, 0.56), S(1.0, 0.5)]),
         ],
     ),
-    # A cabinet maker's oval bulb, narrowed toward a ferrule.
+    # A cabinet maker's oval bulb, which narrows toward a metal ferrule.
     "cabinet": Style(
         _oval,
         [
@@ -160,7 +163,7 @@ STYLES: dict[str, Style] = {
             Zone("metal", [S(0.88, 0.47), S(0.98, 0.45), S(1.0, 0.4)]),
         ],
     ),
-    # Wood with a through blade that ends in a steel striking cap.
+    # Wood; the blade runs through it and ends in a steel striking cap.
     "striking": Style(
         _octagon,
         [
@@ -169,7 +172,8 @@ STYLES: dict[str, Style] = {
             Zone("metal", [S(0.88, 0.96), S(0.98, 0.96), S(1.0, 0.86)]),
         ],
     ),
-    # An impact driver, whose blade turns a little at each hammer blow: a striking cap, and rings.
+    # An impact driver, whose blade turns a little at each hammer blow. It has a striking cap and
+    # rings.
     "impact": Style(
         _octagon,
         [
@@ -181,7 +185,7 @@ STYLES: dict[str, Style] = {
             Zone("metal", [S(0.91, 0.70), S(0.98, 0.70), S(1.0, 0.6)]),
         ],
     ),
-    # Insulated, with a guard at the front that keeps the hand off live parts.
+    # An insulated handle, with a guard at the front that keeps the hand off live parts.
     "insulated": Style(
         _oval,
         [
@@ -199,7 +203,7 @@ STYLES: dict[str, Style] = {
             Zone("metal", [S(0.91, 0.66), S(0.98, 0.66), S(1.0, 0.56)]),
         ],
     ),
-    # A thick pear for the palm.
+    # A thick, pear-shaped handle for the palm.
     "bulb": Style(
         _square,
         [
@@ -218,7 +222,7 @@ STYLES: dict[str, Style] = {
             ),
         ],
     ),
-    # Slim metal, knurled for the fingers, with a spinning cap for the palm.
+    # Slim metal, knurled for the fingers, with a rotating cap for the palm.
     "precision": Style(
         _octagon,
         [
@@ -240,7 +244,7 @@ del S
 def handle(
     style: str, length: float, width: float, height: float, flute: float
 ) -> list[tuple[str, Shape]]:
-    """The zones of a handle as (material, shape), with its front at x = 0. Lengths in mm.
+    """Builds the zones of a handle as (material, shape), with its front at x = 0. Lengths in mm.
 
     Raises:
         ValueError: the style is not known.

@@ -1,4 +1,4 @@
-"""Blades of screwdrivers other than flat ones: shaft and tip in one, along x."""
+"""Blades of screwdrivers that are not flat: shaft and tip in one piece, along x."""
 
 from collections.abc import Callable
 
@@ -13,7 +13,8 @@ _SEGMENTS = 24
 def _round_blade(
     start: float, end: float, diameter: float, stations: list[tuple[float, float]]
 ) -> Shape:
-    """A round shaft from `start` to `end`; stations are (distance from the end, diameter)."""
+    """Builds a round shaft from `start` to `end`; stations are (distance from the end,
+    diameter)."""
     ring = 0.5 * circle(1.0, segments=_SEGMENTS)
     sections = [across_x(diameter * ring, start)]
     sections += [across_x(d * ring, end - x) for x, d in stations]
@@ -21,7 +22,7 @@ def _round_blade(
 
 
 def _phillips(start: float, end: float, diameter: float, length: float, width: float) -> Shape:
-    """A cone with a blunt point and four grooves that leave a cross."""
+    """Builds a cone with a blunt point and four grooves that leave a cross."""
     cone = 0.9 * diameter
     blade = _round_blade(
         start,
@@ -35,7 +36,7 @@ def _phillips(start: float, end: float, diameter: float, length: float, width: f
         ],
     )
     solid = blade.solid
-    # Each groove is a triangular prism on its edge that rises toward the shaft.
+    # Each groove is a triangular prism that lies on its edge and rises toward the shaft.
     root, deep = 0.5 * diameter, 0.15 * diameter
     for quarter in range(4):
         sections = []
@@ -51,7 +52,10 @@ def _phillips(start: float, end: float, diameter: float, length: float, width: f
 
 
 def _prismatic(outline: CrossSection) -> Callable[[float, float, float, float, float], Shape]:
-    """A tip of constant section, given for width 1, on a round shaft that tapers to it."""
+    """Returns a function that builds a tip of constant section on a round shaft that tapers to it.
+
+    `outline` is the section for a tip of width 1.
+    """
 
     def build(start: float, end: float, diameter: float, length: float, width: float) -> Shape:
         tip = outline.scale((width, width))
@@ -64,7 +68,7 @@ def _prismatic(outline: CrossSection) -> Callable[[float, float, float, float, f
             [(0.2 * length, diameter), (0.0, min(reach, diameter))],
         )
         prism = tip.extrude(length, 0, 0.0, (1.0, 1.0)).rotate((0.0, 90.0, 0.0))
-        # The rotation turned the section's x to -z; do the same to the hull.
+        # Rotate the hull like the section, whose x has become -z.
         hull = CrossSection.hull_points(points).to_polygons()[0][:, ::-1] * (1.0, -1.0)
         ends = np.vstack([across_x(hull, end - length), across_x(hull, end)])
         return Shape(blade.solid + prism.translate((end - length, 0.0, 0.0)), [*blade.hulls, ends])
@@ -73,14 +77,15 @@ def _prismatic(outline: CrossSection) -> Callable[[float, float, float, float, f
 
 
 def _star() -> CrossSection:
-    """The six-lobed section of a torx tip, of width 1."""
+    """Returns the six-lobed section of a torx tip of width 1."""
     angle = 2 * np.pi * np.arange(48) / 48
     radius = 0.5 * (0.86 + 0.14 * np.cos(6 * angle))
     return CrossSection([radius[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])])
 
 
 def _socket(start: float, end: float, diameter: float, length: float, width: float) -> Shape:
-    """The socket of a nut driver: a thick tube of outer width `width` with a hexagonal mouth."""
+    """Builds the socket of a nut driver: a thick tube of outer width `width` with a hexagonal
+    mouth."""
     blade = _round_blade(
         start,
         end,
@@ -104,4 +109,5 @@ TIPS: dict[str, Callable[[float, float, float, float, float], Shape]] = {
     "hex": _prismatic(CrossSection([circle(1.0 / np.sqrt(3), segments=6)]).rotate(30.0)),
     "socket": _socket,
 }
-"""Functions of the shaft's start, end and diameter, and the tip's length and width."""
+"""Functions that build a blade. Their arguments are the shaft's start, end and diameter, and the
+tip's length and width."""

@@ -1,4 +1,4 @@
-"""Wrenches: flat forgings with a head at each end of a shank."""
+"""Generates wrenches: flat forgings with a head at each end of a shank."""
 
 import itertools
 from collections.abc import Sequence
@@ -18,31 +18,31 @@ _BEND = 0.56
 class WrenchParameters:
     """A combination wrench with its heads toward +x and -x. Lengths in mm."""
 
-    # From the centre of one head to the centre of the other.
+    # The distance between the centres of the two heads.
     center_distance_mm: float = 172.0
-    # The heads toward +x and -x; a mapping gives the fields of a Head.
+    # The heads toward +x and -x; each may be given as a mapping of a Head's fields.
     front: Head = field(
         default_factory=lambda: Head("open", diameter_mm=38.0, thickness_mm=8.8, angle_deg=15.0)
     )
     back: Head = field(
         default_factory=lambda: Head("box", diameter_mm=28.0, thickness_mm=11.0, points=12)
     )
-    # Widths of the shank at the front and back, its thickness, and the radius of its blend into the
-    # heads.
+    # The widths of the shank at the front and the back, its thickness, and the radius of its
+    # transition to the heads.
     shank_width_front_mm: float = 16.0
     shank_width_back_mm: float = 15.0
     shank_thickness_mm: float = 7.8
     blend_radius_mm: float = 16.0
-    # The offset of an S-shaped shank to either side.
+    # The sideways offset of each end of an S-shaped shank.
     swing_mm: float = 0.0
     # The depth of the recessed panel on each broad side of the shank (negative: the height of a
-    # raised panel), and its width as a share of the shank's.
+    # raised panel), and the panel's width as a share of the shank's width.
     panel_depth_mm: float = 0.9
     panel_share: float = 0.58
-    # The bevel of all outer edges; that of the shank's, if different.
+    # The bevel of all outer edges, and that of the shank's edges (None: the same).
     bevel_mm: float = 0.9
     shank_bevel_mm: float | None = None
-    # A key of solids.MATERIALS.
+    # The material, a key of solids.MATERIALS.
     material: str = "polished_steel"
 
     def __post_init__(self) -> None:
@@ -53,7 +53,7 @@ class WrenchParameters:
 
 
 def build_wrench(p: WrenchParameters) -> list[Part]:
-    """The parts of a wrench, in mm in the design frame."""
+    """Builds the parts of a wrench, in mm in the design frame."""
     x_front, x_back = p.center_distance_mm / 2, -p.center_distance_mm / 2
     front = head_shape(p.front, x_front, 0.0, p.bevel_mm)
     back = head_shape(p.back, x_back, 180.0, p.bevel_mm)
@@ -61,7 +61,7 @@ def build_wrench(p: WrenchParameters) -> list[Part]:
     for head, side in ((p.front, 1), (p.back, -1)):
         if head.neck_mm and not p.swing_mm:
             shank += _shoulders(p, head, side)
-    # Blend shank and heads as one outline; thicker heads are added below.
+    # Round the transitions between shank and heads in one outline; thicker heads are added below.
     outline = blend(front.profile + shank + back.profile, p.blend_radius_mm)
     outline = outline - front.cut - back.cut
     bevel = p.bevel_mm if p.shank_bevel_mm is None else p.shank_bevel_mm
@@ -77,7 +77,7 @@ def build_wrench(p: WrenchParameters) -> list[Part]:
         if p.panel_depth_mm > 0:
             solid -= _panel(p, side)
         elif p.panel_depth_mm < 0:
-            # The raised panel is lower than the heads, so it needs no hulls.
+            # The raised panel is lower than the heads, so it needs no collision hulls.
             solid += _panel(p, side)
     return [*front.inserts, *back.inserts, Part("wrench", p.material, solid, hulls)]
 
@@ -85,35 +85,35 @@ def build_wrench(p: WrenchParameters) -> list[Part]:
 def _slab(
     profile: CrossSection, thickness: float, bevel: float, cells: Sequence[CrossSection]
 ) -> Shape:
-    # Round corners that are sharper than the bevel, which would fold over them.
+    # Round the corners that are sharper than the bevel, because the bevel would fold over them.
     profile = blend(profile, 0.3, 1.4 * bevel)
     return plate(profile, -thickness / 2, thickness / 2, bevel, cells)
 
 
 def _half_width(p: WrenchParameters, x: float) -> float:
-    """Half the width of the shank at x."""
+    """Returns half the width of the shank at x."""
     share = x / p.center_distance_mm + 0.5
     return 0.5 * (p.shank_width_back_mm + share * (p.shank_width_front_mm - p.shank_width_back_mm))
 
 
 def _shoulders(p: WrenchParameters, head: Head, side: int) -> CrossSection:
-    """The convex taper from the head at side +1 or -1 to the shank."""
+    """Returns the convex taper from the head at side +1 or -1 to the shank."""
     x = side * (p.center_distance_mm / 2 - head.neck_mm)
     half = _half_width(p, x)
-    # The taper starts at the side of a box, but behind the jaws of an open end.
+    # The taper starts at the side of a box head, but behind the jaws of an open head.
     radius = (0.37 if head.kind in ("open", "flare_nut") else 0.49) * head.diameter_mm
     disc = circle(radius, (side * p.center_distance_mm / 2, 0.0), 64)
     return CrossSection.hull_points(np.vstack([disc, [(x, -half), (x, half)]]))
 
 
 def _shank_cells(p: WrenchParameters) -> list[CrossSection]:
-    """Regions that cut the shank into convex parts; empty unless both heads are simple.
+    """Returns regions that cut the shank into convex parts; none unless both heads are simple.
 
-    The part of the shank inside a thicker head is left to the head.
+    Where a thicker head covers the shank, that part belongs to the head.
     """
     half, far = p.center_distance_mm / 2, 100.0
     if p.swing_mm:
-        # The bends belong to the end cells, because jaws grip the middle one.
+        # The bends belong to the cells at the ends, because jaws grip the middle cell.
         bend = _BEND * half - 0.7
         return [_rectangle(-bend, bend), *_swung_ends(p, bend)]
     joints: list[float] = []
@@ -131,12 +131,12 @@ def _shank_cells(p: WrenchParameters) -> list[CrossSection]:
 
 
 def _rectangle(x_low: float, x_high: float) -> CrossSection:
-    """The strip between two values of x."""
+    """Returns the strip between two values of x."""
     return CrossSection.square((x_high - x_low, 200.0)).translate((x_low, -100.0))
 
 
 def _swung_ends(p: WrenchParameters, bend: float) -> list[CrossSection]:
-    """The cells of the two ends of an S-shaped shank, between a bend and a head each."""
+    """Returns the cells of the two ends of an S-shaped shank, each between a bend and a head."""
     half = p.center_distance_mm / 2
     cells = []
     for head, side in ((p.front, 1), (p.back, -1)):
@@ -154,7 +154,7 @@ def _between(x_a: float, x_b: float) -> CrossSection:
 
 
 def _shank(p: WrenchParameters) -> np.ndarray:
-    """The outline of the shank alone, between the centres of the heads."""
+    """Returns the outline of the shank alone, between the centres of the heads."""
     x_front, x_back = p.center_distance_mm / 2, -p.center_distance_mm / 2
     if p.swing_mm:
         path = _swung(p)
@@ -170,7 +170,8 @@ def _shank(p: WrenchParameters) -> np.ndarray:
 
 
 def _swung(p: WrenchParameters) -> np.ndarray:
-    """The middle line (n, 2) of an S-shaped shank; its middle is straight, for a gripper."""
+    """Returns the middle line (n, 2) of an S-shaped shank; its middle is straight, for a
+    gripper."""
     half = p.center_distance_mm / 2
     corners = [(-half, 0.0), (-_BEND * half, p.swing_mm), (_BEND * half, -p.swing_mm), (half, 0.0)]
     # Close the loop far below, so that only the two bends are rounded.
@@ -180,7 +181,7 @@ def _swung(p: WrenchParameters) -> np.ndarray:
 
 
 def _panel(p: WrenchParameters, side: int) -> Manifold:
-    """The panel to subtract from or add to one broad side (+1 or -1) of the shank."""
+    """Builds the panel to subtract from or add to one broad side (+1 or -1) of the shank."""
     start = -p.center_distance_mm / 2 + 0.85 * p.back.diameter_mm
     end = p.center_distance_mm / 2 - 0.85 * p.front.diameter_mm
     half_start = 0.5 * p.panel_share * p.shank_width_back_mm
@@ -196,7 +197,7 @@ def _panel(p: WrenchParameters, side: int) -> Manifold:
             0.95 * half_start,
         )
     top = p.shank_thickness_mm / 2
-    # The bevel gives the panel sloped walls, as forging dies do.
+    # Bevel the panel, which gives it sloped walls as forging does.
     if p.panel_depth_mm > 0:
         panel = plate(outline, top - p.panel_depth_mm, top + 4.0, 0.6).solid
     else:

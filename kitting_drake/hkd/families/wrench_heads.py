@@ -1,4 +1,4 @@
-"""Heads of wrenches: the ends of a shank."""
+"""Heads of wrenches, which are the ends of a shank."""
 
 from dataclasses import dataclass, field
 
@@ -21,33 +21,34 @@ from kitting_drake.hkd.tools.solids import (
 class Head:
     """One end of a wrench. Lengths in mm."""
 
+    # The kind of head:
     # - open, box, adjustable, pipe;
     # - ratchet: a box with a geared ring;
     # - flare_nut: a box with a gap for the pipe;
-    # - hook: of a hook spanner;
+    # - hook: the end of a hook spanner;
     # - tail: a round end with a hole;
     # - spike: a taper to align holes;
     # - bar: a handle or striking block across the end.
     kind: str = "open"
-    # The hexagon's size across flats. For other kinds this field is another size:
+    # The hexagon's width across flats. For some kinds this field is another size:
     # - adjustable, pipe: the opening of the jaws;
     # - tail: the diameter of the hole;
     # - hook: the length of its nose;
-    # - spike: its length;
-    # - bar: its depth along the shank.
+    # - spike: the length of the spike;
+    # - bar: the depth of the bar along the shank.
     size_mm: float = 17.0
-    # The head's diameter. For other kinds this field is another size:
+    # The head's diameter. For some kinds this field is another size:
     # - adjustable, pipe: the width across the head;
-    # - spike: the diameter of its foot;
-    # - bar: its length.
+    # - spike: the diameter of its base;
+    # - bar: the length of the bar.
     diameter_mm: float = 38.0
     thickness_mm: float = 8.8
-    # Angle of the head's axis to the shank, in degrees.
+    # The angle between the head's axis and the shank, in degrees.
     angle_deg: float = 0.0
-    # The number of points of a closed socket, 6 or 12.
+    # The number of points of a closed head: 6 for a hexagon, 12 for two.
     points: int = 12
-    # The distance from the head's centre at which straight shoulders meet the shank; 0: no
-    # shoulders, only the blend.
+    # The distance from the head's centre at which straight shoulders meet the shank; 0 for no
+    # shoulders.
     neck_mm: float = 0.0
 
 
@@ -55,18 +56,19 @@ class Head:
 class HeadShape:
     """A placed head, seen from above, with its inserts."""
 
-    # The forged outline, which is blended with the shank's.
+    # The forged outline, which is merged with the shank's outline.
     profile: CrossSection
-    # The area cut out after blending: the slot of an open end or the hole of a box.
+    # The area that is cut out after the merge: the slot of an open end, or the hole of a box.
     cut: CrossSection
     # Separate parts that replace forged material: jaws, screws and rings.
     inserts: list[Part] = field(default_factory=list)
-    # Regions that cut the head into convex parts for collision; empty: triangles are used.
+    # Regions that cut the head into convex parts for collision. If there are none, triangles are
+    # used.
     cells: list[CrossSection] = field(default_factory=list)
 
 
 def head_shape(head: Head, x: float, heading_deg: float, bevel_mm: float) -> HeadShape:
-    """The head at (x, 0), with its axis turned by `heading_deg` plus its own angle from +x.
+    """Returns the head at (x, 0); its axis is `heading_deg` plus the head's own angle from +x.
 
     Raises:
         ValueError: the kind of head is not known.
@@ -85,7 +87,7 @@ def _put(profile: CrossSection, x: float, turn_deg: float) -> CrossSection:
 
 
 def _set(part: Part, x: float, turn_deg: float) -> Part:
-    """Moves a part built about the origin, with its axis along +x, to its head."""
+    """Moves a part, built about the origin with its axis along +x, to its head."""
     c, s = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
     R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     solid = part.solid.rotate((0.0, 0.0, turn_deg)).translate((x, 0.0, 0.0))
@@ -99,13 +101,13 @@ def _flat_part(
     return Part(name, material, shape.solid, shape.hulls)
 
 
-# --- Open end. ---
+# Open ends.
 
 
 def _open(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape:
-    """A disc with two jaws in front.
+    """Draws a disc with two jaws in front.
 
-    The slot has parallel flanks, a floor of two facets of the hexagon, and slightly flared lips.
+    The slot has parallel flanks, slightly flared lips, and a floor with two facets of the hexagon.
     """
     radius = head.diameter_mm / 2
     cheek = (0.82 if head.neck_mm else 0.9) * radius
@@ -122,7 +124,7 @@ def _open(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape:
     )
     disc = CrossSection([circle(radius, segments=64)]) + CrossSection([jaws])
     half, depth = head.size_mm / 2, 0.42 * radius
-    # Heads with straight shoulders have straight outlines, which convex pieces fill well.
+    # Heads with straight shoulders get straight outlines, which convex pieces fill well.
     apex, corner = (0.12 * half, 0.12 * half) if head.neck_mm else (2.0 * half, 0.35 * half)
     slot = fillet(
         [
@@ -136,7 +138,7 @@ def _open(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape:
         ],
         [apex, corner, 1.0, 0.0, 0.0, 1.0, corner],
     )
-    # The two jaws and the two halves behind the floor.
+    # Use one cell for each jaw, and two for the halves behind the floor.
     far, floor = 2.0 * radius, -depth + 0.2 * half
     cells = [
         _rectangle(floor, far, half, far),
@@ -151,11 +153,11 @@ def _open(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape:
     )
 
 
-# --- Closed ends. ---
+# Closed ends.
 
 
 def _socket(head: Head) -> CrossSection:
-    """A closed hole: a hexagon for 6 points, two hexagons for 12."""
+    """Returns a closed hole: a hexagon for 6 points, two hexagons for 12."""
     hexagon = CrossSection([circle(head.size_mm / np.sqrt(3), segments=6)])
     return hexagon if head.points == 6 else hexagon + hexagon.rotate(30)
 
@@ -166,11 +168,11 @@ def _box(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape:
 
 
 def _ratchet(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape:
-    """A round housing with a dark geared ring, and a reversing lever on top."""
+    """Draws a round housing with a dark geared ring, and a reversing lever on top."""
     shape = _box(head, x, turn_deg, bevel)
     top, outer = head.thickness_mm / 2, head.diameter_mm / 2 - bevel
     radius = 0.68 * head.size_mm + 0.8
-    # The ring is recessed in the housing.
+    # The ring lies a little below the housing's surface.
     bore = CrossSection([circle(radius)])
     ring = plate(CrossSection([circle(radius + 0.02)]) - _socket(head), -top + 0.6, top - 0.6, 0.4)
     shape.cut = bore.translate((x, 0.0))
@@ -193,14 +195,14 @@ def _ratchet(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape:
 
 
 def _flare_nut(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape:
-    """A 6-point box with a gap for the pipe, narrower than the nut."""
+    """Draws a 6-point box with a gap for the pipe; the gap is narrower than the nut."""
     radius, half_gap = head.diameter_mm / 2, 0.36 * head.size_mm
     disc = CrossSection([circle(radius, segments=48)])
     gap = [(0.0, -half_gap), (1.4 * radius, -half_gap), (1.4 * radius, half_gap), (0.0, half_gap)]
     cut = CrossSection([circle(head.size_mm / np.sqrt(3), segments=6)]) + CrossSection(
         [np.array(gap)]
     )
-    # One cell for each sixth of the ring.
+    # Use one cell for each sixth of the ring.
     cells = []
     for i in range(6):
         start, end = np.radians([60.0 * i, 60.0 * i + 60.0])
@@ -214,16 +216,16 @@ def _flare_nut(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape
 
 
 def _tail(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape:
-    """A round end with a hole to hang up the wrench."""
+    """Draws a round end with a hole to hang up the wrench."""
     disc = CrossSection([circle(head.diameter_mm / 2, (x, 0.0), 32)])
     return HeadShape(disc, CrossSection([circle(head.size_mm / 2, (x, 0.0), 32)]))
 
 
-# --- Heads with moving jaws. ---
+# Heads with moving jaws.
 
 
 def _knurled(radius: float, length: float, ridges: int) -> Part:
-    """A ridged screw along x about the origin."""
+    """Builds a ridged screw along x about the origin."""
     ring = circle(radius, segments=20)
     stations = np.linspace(-length / 2, length / 2, 2 * ridges + 1)
     sections = [
@@ -233,9 +235,9 @@ def _knurled(radius: float, length: float, ridges: int) -> Part:
 
 
 def _adjustable(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape:
-    """A forged fixed jaw, a sliding jaw, and the knurled screw that moves it.
+    """Draws a forged fixed jaw, a sliding jaw, and the knurled screw that moves it.
 
-    Drawn about the foot of the jaws, which point to +x; the fixed jaw is at +y.
+    The origin is the foot of the jaws, which point to +x; the fixed jaw is at +y.
     """
     s, gap = head.diameter_mm / 42.0, head.size_mm
     body = s * fillet(
@@ -293,9 +295,9 @@ def _adjustable(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShap
 
 
 def _pipe(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape:
-    """A toothed heel jaw, and a hook jaw in a housing with a knurled nut.
+    """Draws a toothed fixed jaw, and a hook jaw in a housing with a knurled nut.
 
-    Drawn about the middle of the heel jaw's face, which faces +x.
+    The origin is the middle of the fixed jaw's face, which faces +x.
     """
     s, gap = head.diameter_mm / 34.0, head.size_mm
     body = s * fillet(
@@ -354,13 +356,13 @@ def _pipe(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape:
     )
 
 
-# --- Hook. ---
+# Hooks.
 
 
 def _hook(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape:
-    """A third of a ring that ends in a nose pointing at the ring's centre.
+    """Draws a third of a ring that ends in a nose pointing at the ring's centre.
 
-    The ring leaves the shank along its axis and bends to +y.
+    The ring starts in the direction of the shank's axis and bends to +y.
     """
     radius = head.diameter_mm / 2
     angles = np.radians(np.linspace(-96.0, 40.0, 25))
@@ -380,18 +382,18 @@ def _hook(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape:
     return HeadShape(_put(arc + hook, x, turn_deg), CrossSection())
 
 
-# --- Ends without a mouth. ---
+# Ends without jaws.
 
 
 def _spike(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape:
-    """A taper to a blunt point."""
+    """Draws a taper to a blunt point."""
     foot, point = head.diameter_mm / 2, 0.2 * head.diameter_mm
     rings = [circle(foot, segments=32), circle(point, (head.size_mm - point, 0.0), 32)]
     return HeadShape(_put(CrossSection.hull_points(np.vstack(rings)), x, turn_deg), CrossSection())
 
 
 def _bar(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape:
-    """A bar with rounded ends across the shank."""
+    """Draws a bar with rounded ends across the shank."""
     depth, length = head.size_mm, head.diameter_mm
     outline = rounded_rectangle(depth, length, 0.2 * min(depth, length), 5)
     return HeadShape(_put(CrossSection([outline]), x, turn_deg), CrossSection())

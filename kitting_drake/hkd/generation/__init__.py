@@ -1,1 +1,1 @@
-"""Generates tools from catalogue entries or at random."""
+"""Generates the models of tools, from catalogue entries or at random."""

@@ -11,7 +11,7 @@ from kitting_drake.hkd.tools.tool import CATEGORIES, RecordLoader
 
 
 class CatalogueError(UserError):
-    """An invalid catalogue entry; the message names the entry and the field."""
+    """Raised for an invalid catalogue entry; the message names the entry and the field."""
 
 
 @dataclass
@@ -30,15 +30,19 @@ class ToolEntry:
     name: str
     category: str
     split: str
-    # The length to scale the design to.
+    # The length in mm to which the design is scaled.
     length_mm: float
     grasp: GraspEntry
-    # Overrides of the category's default parameters.
+    # Parameters of the design that differ from the category's defaults.
     parameters: dict[str, Any] = field(default_factory=dict)
 
 
 def load_catalogue(path: Path) -> list[ToolEntry]:
-    """Reads `catalogue.yaml`; raises CatalogueError for an invalid entry."""
+    """Reads `catalogue.yaml`.
+
+    Raises:
+        CatalogueError: an entry is invalid.
+    """
     try:
         data = yaml.load(path.read_text(), Loader=RecordLoader)
     except OSError as error:

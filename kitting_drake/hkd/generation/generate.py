@@ -35,18 +35,18 @@ from kitting_drake.hkd.tools.symmetry import symmetry_order
 from systems.hand_geometry import FINGER_LENGTH, PAD_LENGTH
 
 # The clearance of a kit's cavities. Collision hulls may bridge notches narrower than twice this,
-# because cavities do too.
+# because cavities bridge them too.
 CAVITY_CLEARANCE_MM = 2.0
-# Tolerances of the outline for merging collision hulls, and for thinning their vertices.
+# Tolerances of the outline: for merging collision hulls, and for thinning their vertices.
 MERGE_TOLERANCE_MM = 0.25
 VERTEX_TOLERANCE_MM = 0.2
-# The tolerance for merging at the gripped faces.
+# The tolerance for merging hulls at the gripped faces.
 GRIP_TOLERANCE_MM = 0.06
-# The largest distance of an annotated grasp from the middle of the gripped faces.
+# The largest distance of an annotated grasp from the middle between the gripped faces.
 GRIP_CENTRING_MM = 0.2
-# Edges sharper than this are shaded as edges.
+# The angle between faces above which their edge is shaded as a sharp edge.
 CREASE_ANGLE_DEG = 35.0
-# The lengths of the pads and fingers along the tool, with a margin for an inexact grasp.
+# The lengths of pads and fingers along the tool, with a margin for an inexact grasp.
 PAD_LENGTH_MM = round(1e3 * PAD_LENGTH + 0.4, 3)
 FINGER_LENGTH_MM = round(1e3 * FINGER_LENGTH + 1.2, 3)
 
@@ -65,23 +65,25 @@ class Report:
     description: dict[str, Any]
     triangles: int
     collision_hulls: int
-    # The largest distance of the collision outline outside and inside the visual outline.
+    # The largest distances of the collision outline outside and inside the visual outline.
     outside_mm: float
     inside_mm: float
-    # Collision minus visual: lowest point, highest point and gripped width.
+    # Differences of collision geometry minus visual geometry: lowest point, highest point, gripped
+    # width.
     bottom_error_mm: float
     top_error_mm: float
     grip_error_mm: float
-    # The variation of the gripped faces along the pads, and how far the tool sticks out past them
+    # The variation of the gripped faces along the pads, and how far the tool stands out beyond them
     # at the fingers.
     grip_flatness_mm: float
     finger_overhang_mm: float
-    # The tilt of the stable pose from the design's.
+    # The tilt of the stable pose relative to the design's pose.
     tilt_deg: float
 
 
 def build_parts(entry: ToolEntry) -> list[Part]:
-    """The tool's parts in the design frame in mm, scaled to its length and without overlaps."""
+    """Returns a tool's parts in the design frame in mm, scaled to its length and without
+    overlaps."""
     parameters_type, build = DESIGNS[entry.category]
     known = {f.name for f in dataclasses.fields(parameters_type)}
     if unknown := sorted(set(entry.parameters) - known):
@@ -105,16 +107,16 @@ def build_parts(entry: ToolEntry) -> list[Part]:
 
 
 def homogeneous(parts: list[Part]) -> list[Body]:
-    """The parts of a tool and their densities."""
+    """Returns the parts of a tool with their densities."""
     return [(part.solid, MATERIALS[part.material].density) for part in parts]
 
 
 def rest_rotation(points: np.ndarray, center_of_mass: np.ndarray) -> np.ndarray:
-    """R_TD (3, 3): the rotation to the stable pose nearest to the design pose.
+    """Returns R_TD (3, 3), the rotation to the stable pose nearest to the design's pose.
 
     Args:
-        points: (n, 3) in the design frame D; their convex hull is the body's.
-        center_of_mass: (3,) in D.
+        points: (n, 3) in the design frame D; the body's convex hull is theirs.
+        center_of_mass: (3,) in D, in the unit of the points.
     """
     poses = stable_poses(points, center_of_mass)
     nearest = max(poses, key=lambda pose: -pose.normal[2])
@@ -122,11 +124,11 @@ def rest_rotation(points: np.ndarray, center_of_mass: np.ndarray) -> np.ndarray:
 
 
 def generate_tool(entry: ToolEntry, directory: Path) -> Report:
-    """Writes a tool's model to `directory` atomically, replacing an older one.
+    """Writes a tool's model to `directory` atomically; replaces an older model.
 
     Raises:
         CatalogueError: the entry does not make a usable tool.
-        MachineError: the model cannot be written. In both cases the older one remains.
+        MachineError: the model cannot be written. After either error the older model is unchanged.
     """
     try:
         directory.parent.mkdir(parents=True, exist_ok=True)
@@ -144,7 +146,7 @@ def _write_tool(entry: ToolEntry, directory: Path) -> Report:
     """Writes the model of one tool into an empty folder; see `generate_tool`."""
     parts = build_parts(entry)
     mass, center, inertia = mass_properties(homogeneous(parts))
-    # Merge the hulls in the stable pose, whose outline and heights matter.
+    # Merge the hulls in the stable pose, because the outline and the heights in this pose matter.
     R_TD, p_T, whole = _tool_frame(entry, parts, center)
     outline = closed(whole.project(), CAVITY_CLEARANCE_MM)
     hulls = _collision_hulls(parts, R_TD, p_T, outline, entry.grasp)
@@ -186,12 +188,16 @@ def _write_tool(entry: ToolEntry, directory: Path) -> Report:
 def _tool_frame(
     entry: ToolEntry, parts: list[Part], center: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, Manifold]:
-    """R_TD, p_T (mm), and the union of the parts (mm) in the tool frame T.
+    """Places a tool in its frame T.
 
     Args:
         entry: the tool's entry in the catalogue.
-        parts: in the design frame D.
+        parts: the tool's parts in the design frame D.
         center: (3,) the centre of mass in D, in metres.
+
+    Returns:
+        R_TD (3, 3), p_T (3,) in mm, and the union of the parts in T, in mm. A point q of D is at
+        R_TD q + p_T.
 
     Raises:
         CatalogueError: the parts do not touch.
@@ -210,7 +216,7 @@ def _tool_frame(
 def _collision_hulls(
     parts: list[Part], R_TD: np.ndarray, p_T: np.ndarray, outline: CrossSection, grasp: GraspEntry
 ) -> list[np.ndarray]:
-    """The collision hulls (n, 3) in T in mm, in a deterministic order."""
+    """Returns the collision hulls (n, 3) in T in mm, in a deterministic order."""
     hulls = [h @ R_TD.T + p_T for part in parts for h in part.hulls]
     covering = cover(hulls, outline, _allowed(outline, grasp), MERGE_TOLERANCE_MM)
     return sorted(
@@ -220,7 +226,8 @@ def _collision_hulls(
 
 
 def _allowed(outline: CrossSection, grasp: GraspEntry) -> CrossSection:
-    """The region that collision hulls may cover: the outline and a margin, small at the grip."""
+    """Returns the region that collision hulls may cover: the outline and a margin, small at the
+    grip."""
 
     def grown(distance: float) -> CrossSection:
         return outline.offset(distance, JoinType.Round, circular_segments=96)
@@ -254,7 +261,7 @@ class _GripReport:
     width: float
     # The variation of the gripped faces along the pads.
     flatness: float
-    # How far the tool sticks out past the gripped faces at the fingers.
+    # How far the tool stands out beyond the gripped faces at the fingers.
     overhang: float
     # The height of the tool's top at the grasp.
     top: float
@@ -264,7 +271,7 @@ def _measure_grasp(entry: ToolEntry, solid: Manifold) -> _GripReport:
     """Measures the annotated grasp on a tool at rest in its frame T.
 
     Raises:
-        CatalogueError: the jaws cannot hold the tool there.
+        CatalogueError: the jaws cannot hold the tool by this grasp.
     """
     grasp = entry.grasp
     named = f"tool {entry.name}: the grasp at ({grasp.x_mm}, {grasp.y_mm}) mm"
@@ -277,7 +284,7 @@ def _measure_grasp(entry: ToolEntry, solid: Manifold) -> _GripReport:
         x, y = (grasp.x_mm, grasp.y_mm) + offset * along
         found = find_grip(triangles, x, y, theta, length)
         if found is None:
-            raise CatalogueError(f"{named} holds nothing at ({x:.2f}, {y:.2f}) mm")
+            raise CatalogueError(f"{named} has nothing between the pads at ({x:.2f}, {y:.2f}) mm")
         return found
 
     pad, finger = grip(0.0, PAD_LENGTH_MM), grip(0.0, FINGER_LENGTH_MM)
@@ -285,7 +292,8 @@ def _measure_grasp(entry: ToolEntry, solid: Manifold) -> _GripReport:
     if not 8.0 <= pad.width <= 35.0:
         raise CatalogueError(f"{named} is {pad.width:.1f} mm wide; it must be 8 to 35 mm")
     if abs(pad.middle) > GRIP_CENTRING_MM:
-        # Closing jaws would shift the tool, and it would be placed with the same offset.
+        # A tool that is held off centre is shifted by the closing jaws, and is then placed with
+        # this offset.
         raise CatalogueError(
             f"{named} is not centred between the gripped faces: move it by "
             f"{pad.middle:+.2f} mm along the jaws"
@@ -307,7 +315,7 @@ def _description(
     grip: _GripReport,
     visuals: list[tuple[str, str]],
 ) -> dict[str, Any]:
-    """The content of `tool.yaml`: SI units, frame T."""
+    """Returns the content of `tool.yaml`, in SI units, in frame T."""
 
     def metres(value_mm: float) -> float:
         return round(1e-3 * float(value_mm), 6)

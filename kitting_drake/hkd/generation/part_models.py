@@ -24,10 +24,10 @@ from kitting_drake.hkd.tools.solids import MATERIALS
 from kitting_drake.hkd.tools.tool import Tool, load_tool, tool_names, user_tool_names
 
 _MODULUS = 2e7
-"""The hydroelastic modulus in Pa. The pads' 30 N press on few square millimetres of a small part,
-and would squeeze a softer one by millimetres."""
+"""The hydroelastic modulus in Pa. The pads press with 30 N on a few square millimetres of a small
+part, and would sink into a softer part by millimetres."""
 _FORMAT_VERSION = "3"
-"""Part of the cache's paths. Change it when equal names give other models."""
+"""The version of the files in the cache. Increase it when equal names give different models."""
 _CREASE_ANGLE_DEG = 35.0
 _NAME = re.compile(r"([a-z]+)(?:_(\d+(?:\.\d+)?(?:x\d+(?:\.\d+)?)*))?")
 
@@ -35,11 +35,12 @@ _NAME = re.compile(r"([a-z]+)(?:_(\d+(?:\.\d+)?(?:x\d+(?:\.\d+)?)*))?")
 def load_named(name: str, base: Path | None = None) -> Tool:
     """Loads a tool by its name or folder (`load_tool`), or makes a part by its name.
 
-    A part's name is its kind (`PART_KINDS`), or kind and dimensions in mm, as `ring_40x20x10`. The
-    tools of the project and the user's own come first.
+    A part's name is its kind (`PART_KINDS`), or its kind and dimensions in mm, such as
+    `ring_40x20x10`. If a tool of the project or the user has the same name, the tool is loaded.
 
     Raises:
-        UserError: there is neither, the tool's files are broken, or the dimensions are impossible.
+        UserError: there is neither a tool nor a part of this name, the tool's files are broken, or
+            the dimensions are impossible.
     """
     kind = _parsed(name)
     if kind is None or name in tool_names() or name in user_tool_names():
@@ -53,12 +54,13 @@ def is_part_kind(name: str) -> bool:
 
 
 def sized_part(kind: str, length: float, shares: tuple[float, float]) -> Tool:
-    """A part of a given length, to 0.1 mm.
+    """Makes a part of a given length, which is rounded to 0.1 mm.
 
     Args:
         kind: a key of `PART_KINDS`.
-        length: in metres. A kind that does not come so short or long gets the nearest length.
-        shares: two numbers from 0 to 1 that vary its proportions.
+        length: the length in metres. If the kind does not exist in this length, the nearest
+            possible length is used.
+        shares: two numbers from 0 to 1 that vary the part's proportions.
 
     Raises:
         UserError: there is no such part.
@@ -69,11 +71,11 @@ def sized_part(kind: str, length: float, shares: tuple[float, float]) -> Tool:
 
 
 def make_part(kind: str, dimensions: tuple[float, ...]) -> Tool:
-    """The tool of a part: in the cache, made when it is missing.
+    """Returns the tool of a part from the cache; makes it if it is missing.
 
     Args:
         kind: a key of `PART_KINDS`.
-        dimensions: in mm; see `PartKind.dimensions`.
+        dimensions: the dimensions in mm; see `PartKind.dimensions`.
 
     Raises:
         UserError: the dimensions do not make a part that the hand can hold.
@@ -93,7 +95,8 @@ def make_part(kind: str, dimensions: tuple[float, ...]) -> Tool:
 
 
 def _parsed(name: str) -> tuple[str, tuple[float, ...]] | None:
-    """The kind and the dimensions of a part's name; None if it is not one."""
+    """Splits a part's name into kind and dimensions in mm; returns None if it is not a part's
+    name."""
     match = _NAME.fullmatch(name)
     if match is None or match[1] not in PART_KINDS:
         return None
@@ -143,7 +146,7 @@ def _record(
     origin: np.ndarray,
     mass: float,
 ) -> dict[str, Any]:
-    """The content of `tool.yaml`: SI units, frame T."""
+    """Returns the content of `tool.yaml`, in SI units, in frame T."""
 
     def metres(value_mm: float) -> float:
         return round(1e-3 * float(value_mm), 6)

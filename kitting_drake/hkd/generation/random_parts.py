@@ -1,6 +1,6 @@
 """Random solids for training: flat outlines, rings, plates, discs, rods and bolts.
 
-They stand beside the random tools, so that networks see more than hand tools.
+They are drawn besides the random tools, so that networks see more than hand tools.
 """
 
 import math
@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 _SIZES_MM = (18.0, 140.0)
-"""The range of the solids' lengths."""
+"""The range of the solids' lengths, in mm."""
 _SEGMENTS = 48
 _THICK_MM = (5.0, 40.0)
-"""The range of a flat solid's thickness."""
+"""The range of a flat solid's thickness, in mm."""
 
 
 def draw_solid(rng: np.random.Generator) -> Manifold:
-    """Draws a solid that lies as it rests on the table, in mm.
+    """Draws a random solid in its resting pose, in mm.
 
     Args:
         rng: the random generator of all draws.
@@ -33,19 +33,19 @@ def draw_solid(rng: np.random.Generator) -> Manifold:
     scale = length / max(high_x - low_x, high_y - low_y)
     outline = outline.scale((scale, scale))
     radius = 0.03 * length
-    # Round the corners, as milled and moulded parts have them.
+    # Round the corners, as on milled and moulded parts.
     outline = outline.offset(-radius).offset(2 * radius, circular_segments=16).offset(-radius)
     thickness = float(np.clip(rng.uniform(0.1, 0.8) * length, *_THICK_MM))
     solid = outline.extrude(thickness)
     if rng.random() < 0.2:
-        # A step, as of a flange.
+        # Add a step, as on a flange.
         inner = outline.offset(-rng.uniform(0.1, 0.25) * length)
         solid += inner.extrude(thickness * rng.uniform(1.1, 1.6))
     return solid
 
 
 def _polygon(rng: np.random.Generator) -> CrossSection:
-    """A regular polygon, or an irregular one of 3 to 9 corners."""
+    """Draws a regular polygon, or an irregular one with 3 to 9 corners."""
     count = int(rng.integers(3, 10))
     angles = np.arange(count) * math.tau / count
     radii = np.ones(count)
@@ -59,7 +59,7 @@ def _polygon(rng: np.random.Generator) -> CrossSection:
 
 
 def _blob(rng: np.random.Generator) -> CrossSection:
-    """A smooth outline: a circle with random waves."""
+    """Draws a smooth outline: a circle with random waves."""
     angles = np.arange(96) * math.tau / 96
     radius = np.ones(96)
     for order in range(1, 6):
@@ -70,7 +70,7 @@ def _blob(rng: np.random.Generator) -> CrossSection:
 
 
 def _letter(rng: np.random.Generator) -> CrossSection:
-    """A few bars that are joined, as in letters and brackets."""
+    """Draws a few joined bars, as in letters and brackets."""
     width = rng.uniform(0.18, 0.35)
     bar = CrossSection.square((1.0, width), True)
     whole = bar
@@ -89,7 +89,7 @@ def _ring(rng: np.random.Generator) -> CrossSection:
 
 
 def _plate(rng: np.random.Generator) -> CrossSection:
-    """A rectangle or a disc, perhaps with a hole."""
+    """Draws a rectangle or a disc, which may have a hole."""
     if rng.random() < 0.3:
         return CrossSection.circle(0.5, _SEGMENTS)
     width = rng.uniform(0.25, 1.0)
@@ -101,7 +101,7 @@ def _plate(rng: np.random.Generator) -> CrossSection:
 
 
 def _star(rng: np.random.Generator) -> CrossSection:
-    """A star, a gear or a cross."""
+    """Draws a star, a gear or a cross."""
     count = int(rng.integers(4, 9))
     inner = rng.uniform(0.4, 0.8)
     angles = np.arange(2 * count) * math.pi / count
@@ -110,7 +110,7 @@ def _star(rng: np.random.Generator) -> CrossSection:
 
 
 def _rod(length: float, rng: np.random.Generator) -> Manifold:
-    """A lying cylinder, perhaps with a thicker head, as of a bolt."""
+    """Draws a lying cylinder, which may have a thicker head like a bolt."""
     radius = float(np.clip(length * rng.uniform(0.08, 0.3), 3.0, 20.0))
     rod = Manifold.cylinder(length, radius, circular_segments=_SEGMENTS)
     if rng.random() < 0.5:

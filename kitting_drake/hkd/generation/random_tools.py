@@ -1,9 +1,9 @@
 """Random tools for training: shapes that are not in the catalogue.
 
 Many are designs of the training split with random proportions. Others are composed of simple
-solids, like mallets, keys, scrapers and chisels, or are simple parts (`random_parts`). All are
-randomly stretched, splayed, bent and mirrored. They have surfaces and grasps, but no collision
-geometry and no files.
+solids, such as mallets, keys, scrapers and chisels, or are simple parts (`random_parts`). All are
+randomly stretched, widened toward one end, bent and mirrored. They have surfaces and grasps, but no
+collision geometry and no files.
 """
 
 import copy
@@ -35,20 +35,21 @@ from kitting_drake.hkd.tools.tool import Tool
 Array = NDArray[np.float64]
 
 _LENGTHS, _SHORT, _LONG = (0.11, 0.23), (0.05, 0.11), (0.23, 0.32)
-"""Ranges of the tools' lengths, in metres: of most, and of `_UNUSUAL` each."""
+"""Ranges of the tools' lengths, in metres: usual, short and long tools. The share of short tools is
+`_UNUSUAL`, and so is that of long ones."""
 _UNUSUAL = 0.12
 _HIGHEST = 0.046
 """The largest height that fits into a kit's block, in metres."""
 _COMPOSED, _PARTS = 0.2, 0.3
-"""The shares of tools composed of simple solids, and of simple parts."""
+"""The share of tools that are composed of simple solids, and the share of simple parts."""
 _JITTER = 0.22
-"""The logarithm of the largest factor on each length and angle of a design."""
+"""The logarithm of the largest factor for each length and angle of a design."""
 _REFINED = 6.0
-"""The longest edge of triangles before the warp, in mm."""
+"""The longest edge of the triangles before the warp, in mm."""
 _SIMPLIFIED = 0.08
 """The tolerance of the simplification after the warp, in mm."""
 _POOR_GRASP = 3.0
-"""Grasps that cost more are not used; see `GraspProposal.cost`."""
+"""The cost above which grasps are not used; see `GraspProposal.cost`."""
 _ATTEMPTS = 40
 
 
@@ -57,9 +58,9 @@ class RandomTool(Tool):
     """A tool without files."""
 
     surface: Array = field(default_factory=lambda: np.zeros((0, 3, 3)), repr=False)
-    """(n, 3, 3) the triangles in T, in metres."""
+    """The triangles (n, 3, 3) of the surface in T, in metres."""
     grasps: tuple[GraspProposal, ...] = ()
-    """Possible grasps, best first."""
+    """The possible grasps, best first."""
 
     @property
     def triangles(self) -> Array:
@@ -81,7 +82,7 @@ def draw_tool(entries: Sequence[ToolEntry], rng: np.random.Generator, name: str)
         try:
             tool = _attempt(entries, rng, name)
         except (UserError, QhullError, ValueError, ZeroDivisionError, IndexError, TypeError):
-            # Contradictory proportions make no solid; try again.
+            # Try again, because contradictory proportions make no solid.
             continue
         if tool is not None:
             return tool
@@ -143,14 +144,14 @@ def _attempt(
 
 
 def _draw_length(rng: np.random.Generator) -> float:
-    """A tool's length, in metres."""
+    """Draws a tool's length, in metres."""
     kind = rng.random()
     ranges = _SHORT if kind < _UNUSUAL else _LONG if kind > 1 - _UNUSUAL else _LENGTHS
     return float(rng.uniform(*ranges))
 
 
 def _varied(entry: ToolEntry, rng: np.random.Generator) -> ToolEntry:
-    """The design with random proportions, including those at their default values."""
+    """Returns a design with random proportions, also for those at their default values."""
     defaults = DESIGNS[entry.category][0]()
     parameters = {
         key: value for key, value in vars(defaults).items() if isinstance(value, float)
@@ -175,17 +176,19 @@ def _jittered(key: str, value: Any, rng: np.random.Generator, spread: float) -> 
 
 @dataclass(frozen=True)
 class _Warp:
-    """A map of points (n, 3) in mm: stretch and splay across the tool's axis x, then bend."""
+    """A map of points (n, 3) in mm. It stretches and widens the tool across its axis x, and then
+    bends it."""
 
     low: float
-    """The tool's lower end along x."""
+    """The x of the tool's lower end, in mm."""
     length: float
     stretch: Array
-    """(2,) factors along y and z."""
+    """The factors (2,) along y and z."""
     splay: float
-    """The relative widening of the forward end against the middle."""
+    """The factor by which the forward end is wider than the middle, minus 1."""
     bend: Array
-    """(2,) coefficients of the square and the cube of x in half lengths, from the middle."""
+    """The coefficients (2,) of the square and the cube of x, measured from the middle in half
+    lengths."""
 
     @classmethod
     def draw(cls, solid: Manifold, rng: np.random.Generator) -> "_Warp":
@@ -212,7 +215,8 @@ def _centroid(solid: Manifold) -> Array:
 
 
 def _composed(rng: np.random.Generator) -> Manifold:
-    """A shaft along x with one to four solids at its ends or along it, in mm, lying flat."""
+    """Composes a shaft along x with one to four solids at its ends or along it, in mm, lying
+    flat."""
     length = 180.0
     width, height = rng.uniform(6, 30), rng.uniform(5, 28)
     solid = _bar(length, width, height, rng)
@@ -249,7 +253,7 @@ def _composed(rng: np.random.Generator) -> Manifold:
 
 
 def _bar(length: float, width: float, height: float, rng: np.random.Generator) -> Manifold:
-    """A bar along x with a rectangular, rounded or elliptic section that may taper."""
+    """Draws a bar along x with a rectangular, rounded or elliptic section, which may taper."""
     kind = rng.integers(3)
     if kind == 0:
         section = CrossSection.square((width, height), True)
@@ -262,5 +266,5 @@ def _bar(length: float, width: float, height: float, rng: np.random.Generator) -
         section = CrossSection.circle(0.5, 32).scale((width, height))
     top = (rng.uniform(0.5, 1.0), rng.uniform(0.7, 1.0))
     bar = section.extrude(length, scale_top=top).translate((0, 0, -length / 2))
-    # Turn the extrusion from z to x, with the section's width along y and its height along z.
+    # Turn the extrusion from z to x, so that the section's width is along y and its height along z.
     return bar.rotate((0, 90, 0)).rotate((90, 0, 0))

@@ -1,1 +1,1 @@
-"""Grasps: measured and proposed from a tool's surface."""
+"""Grasps that are measured on a tool's surface, or proposed from it."""

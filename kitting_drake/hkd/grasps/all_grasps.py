@@ -1,4 +1,4 @@
-"""All grasps of a tool: the annotated one, and those that its surface proposes."""
+"""All grasps of a tool: the annotated one, and proposals computed from its surface."""
 
 import hashlib
 import json
@@ -17,18 +17,19 @@ from systems.grasp import Grasp
 from systems.grip_force import GRAVITY
 
 _FORMAT_VERSION = "1"
-"""Part of the cache key. Change it when equal tools give other grasps."""
+"""The version of the files in the cache. Increase it when equal tools give different grasps."""
 _FILE = "grasps.json"
 _EASY_MOMENT = 0.18
-"""A moment about the axis of the pads that they hold easily, in N m."""
+"""The moment about the axis of the pads that they hold easily, in N m."""
 _WORST = 12.5
-"""Proposals of a higher cost are left out."""
+"""The cost above which proposals are left out."""
 
 
 def all_grasps(tool: Tool) -> tuple[Grasp, ...]:
-    """The annotated grasp, then the proposals, best first.
+    """Returns the annotated grasp and then the proposals, best first.
 
-    Proposals take a second or two, and are kept in the cache. Those of a scaled tool are scaled.
+    Computing proposals takes a second or two, so they are kept in the cache. For a scaled tool, the
+    original's proposals are scaled.
 
     Raises:
         UserError: a mesh or the model cannot be read, or the cache cannot be written.
@@ -46,7 +47,9 @@ def all_grasps(tool: Tool) -> tuple[Grasp, ...]:
         rows = json.loads((folder / _FILE).read_text())
         unscaled = [Grasp(*map(float, row)) for row in rows]
     except (OSError, ValueError, TypeError) as error:
-        raise UserError(f"{folder / _FILE} is damaged: delete {folder}") from error
+        raise UserError(
+            f"{folder / _FILE} is damaged: delete the folder {folder}, and it is made again"
+        ) from error
     s = tool.scale
     proposed = [
         Grasp(s * g.x, s * g.y, g.theta, s * g.width, s * g.surface_height) for g in unscaled
@@ -55,12 +58,14 @@ def all_grasps(tool: Tool) -> tuple[Grasp, ...]:
 
 
 def carrying_grasps(tool: Tool) -> tuple[Grasp, ...]:
-    """The tool's own grasps, unless it would turn between the pads in the first of them.
+    """Returns the grasps by which to carry a tool, best first.
 
-    Then all its grasps, those first in which the moment of its weight is easily held.
+    These are usually the tool's own grasps. If the tool's weight would turn it between the pads in
+    the first of them, they are the grasps of `all_grasps`, ordered by the moment of the weight that
+    the pads cannot hold.
 
     Raises:
-        UserError: as `all_grasps`.
+        UserError: as for `all_grasps`.
     """
     com = _center_of_mass(tool)
 
@@ -80,7 +85,7 @@ def _proposals(tool: Tool, com: NDArray[np.float64]) -> list[list[float]]:
 
 
 def _center_of_mass(tool: Tool) -> NDArray[np.float64]:
-    """(3,) in T, in metres."""
+    """Returns the centre of mass (3,) in T, in metres."""
     try:
         pose = ElementTree.parse(tool.sdf).getroot().findtext(".//inertial/pose", "0 0 0")
         return np.array([float(word) for word in pose.split()[:3]])

@@ -1,8 +1,9 @@
-"""Grasps without two flat faces: of a corner, and of a taper.
+"""Grasps of tools without two parallel faces: by a corner, or by a taper.
 
-A soft pad yields to a corner. Opposite a face, the pads hold the tool where its width is least, so
-that squeezing turns it flat onto the pad. Opposite a notch, the two ends of the pad hold it. Where
-the tool tapers along the pads, it is held at their ends, and friction keeps it from slipping out.
+A soft pad yields to a corner. If there is a face on the other side, the pads close where the tool's
+width is least, and squeezing turns the face flat onto its pad. If there is a notch on the other
+side, its two ends touch the pad. Where the tool tapers along the pads, the ends of the pads hold
+it, and friction keeps it from slipping out.
 """
 
 import numpy as np
@@ -11,32 +12,37 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 LEAST_WIDTH = 0.008
-"""The smallest width to hold at a corner, in metres: a thinner tool would turn."""
+"""The smallest width to hold at a corner, in metres; a thinner tool would turn."""
 
-# How far a corner sinks into a pad, in metres.
+# The depth to which a corner sinks into a pad, in metres.
 _SOFT = 0.0008
-# A corner is held steadily opposite a face that supports the pad this far to either side of it.
-# Opposite another corner it may be off by the second length.
+# A corner opposite a face is held firmly if the face supports the pad over the first length, in
+# metres, to either side of the corner. Two opposite corners are held if they are offset along the
+# pads by at most the second length.
 _CORNER_MARGIN, _CORNER_OFFSET = 0.002, 0.0005
-# A taper is held if its faces lean by at most this slope, measured over this length.
+# A taper is held if its faces lean by at most this slope, measured over this length in metres.
 _TAPER, _TAPER_LENGTH = float(np.tan(np.radians(24.0))), 0.004
-# The costs of holding a corner against a face, with an addition if it touches only part of a pad;
-# a taper, with an addition for the slope; and a corner against another, where the tool may turn.
+# The costs of three kinds of holds: a corner against a face, plus an amount if the corner touches
+# only part of a pad; a taper, plus an amount for its slope; and two opposite corners, between which
+# the tool may turn.
 _CORNER_COST, _NOT_FLAT_COST = 0.5, 2.0
 _TAPER_COST, _SLOPE_COST = 0.8, 0.5
 _TWO_CORNERS_COST = 2.5
 
 
 def corner_cost(left: Array, right: Array, column: float, touch: float) -> float | None:
-    """The cost of holding a corner or a taper; None if the tool would turn or slip out of the pads.
+    """Returns the cost of holding a corner or a taper; None if the tool would turn or slip out of
+    the pads.
 
-    The pads push along one line only if the corner is between the ends of the other pad's contact.
+    The tool does not turn if the corner is between the ends of the other pad's contact, because the
+    forces of the pads then act along one line.
 
     Args:
-        left: (columns, levels) the surface under the left pad.
-        right: the same for the right one.
+        left: (columns, levels) the position of the surface under the left pad, in metres.
+        right: (columns, levels) the position of the surface under the right pad, in metres.
         column: the length of a column, in metres.
-        touch: a flat face touches where it lies less than this behind the foremost point.
+        touch: the depth behind the foremost point, in metres, up to which a flat face touches a
+            pad.
     """
     behind = [(left.max() - left).min(axis=1), (right - right.min()).min(axis=1)]
     spans = [column * np.flatnonzero(depth <= _SOFT) for depth in behind]

@@ -1,7 +1,8 @@
 """The grip: the faces between which the jaws hold a tool from above.
 
-The pads close on the surface that reaches furthest between them. So a grip is the extent, along the
-closing direction, of the surface between the two planes through the pads' ends.
+The closing pads meet the part of the surface between them that stands out farthest. So a grip is
+the extent, along the closing direction, of the surface between the two planes through the pads'
+ends.
 """
 
 from dataclasses import dataclass
@@ -14,13 +15,15 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Grip:
-    """The extent of the surface between the jaws, in the unit of the triangles."""
+    """The extent of the surface between the jaws, in the unit of the triangles (see
+    `find_grip`)."""
 
     low: float
-    """The least coordinate along the closing direction, measured from (x, y) of `find_grip`."""
+    """The least coordinate along the closing direction, measured from the point (x, y) of
+    `find_grip`."""
     high: float
     top: float
-    """The greatest height."""
+    """The greatest height of the surface between the jaws."""
 
     @property
     def width(self) -> float:
@@ -34,12 +37,13 @@ class Grip:
 
 
 def find_grip(triangles: Array, x: float, y: float, theta: float, length: float) -> Grip | None:
-    """The grip of pads of a given length, independent of their position across the tool.
+    """Finds the grip of pads of a given length, whatever their position along the closing
+    direction.
 
     Args:
         triangles: (n, 3, 3) the surface of a tool in its frame T.
-        x: x of the middle of the pads in T.
-        y: the same.
+        x: the x of the middle of the pads in T.
+        y: the y of the middle of the pads in T.
         theta: the rotation of the hand about T's z, in radians; at zero the jaws close along y.
         length: the length of the pads, perpendicular to the closing direction.
 
@@ -55,13 +59,14 @@ def find_grip(triangles: Array, x: float, y: float, theta: float, length: float)
 
 
 def jaw_axes(theta: float) -> tuple[Array, Array]:
-    """The unit vectors (2,) in T along the pads and along the closing direction."""
+    """Returns the unit vectors (2,) in T along the pads and along the closing direction."""
     along = np.array([np.cos(theta), np.sin(theta)])
     return along, np.array([-along[1], along[0]])
 
 
 def _points_between(triangles: Array, normal: Array, distance: float) -> Array:
-    """The corners (m, 3) of triangles (n, 3, 3) clipped to |normal . p| <= distance."""
+    """Clips triangles (n, 3, 3) to |normal . p| <= distance; returns the corners (m, 3) of the
+    rest."""
     starts, ends = triangles.reshape(-1, 3), np.roll(triangles, -1, axis=1).reshape(-1, 3)
     start_heights, end_heights = starts @ normal, ends @ normal
     found = [starts[np.abs(start_heights) <= distance]]

@@ -1,9 +1,10 @@
 """Grasp proposals computed from a tool's surface (section IV-B.3 of the paper).
 
-The jaws of a hand that comes from above close on the surface that stands out furthest between them.
-So for a rotation theta of the hand and a position u along its pads, only the tool's extent to
-either side at each height matters. Horizontal slices of the tool give these extents. The position
-along the closing direction follows, because a grasp is centred between the gripped faces.
+The hand comes from above, and its jaws close on the part of the surface between them that stands
+out farthest. For a rotation theta of the hand and a position u along its pads, only the tool's
+extents to either side matter, at each height. Horizontal slices of the tool give these extents. The
+position along the closing direction follows from them, because a grasp is centred between the
+gripped faces.
 """
 
 from dataclasses import dataclass, field, replace
@@ -19,56 +20,57 @@ from systems.pick_place_parameters import PickPlaceParameters
 
 Array = NDArray[np.float64]
 
-# Lengths are in m.
+# Lengths are in metres.
 PLANNER = PickPlaceParameters()
 """The default planner, for which tools are annotated and kits laid out."""
 GRASP_DEPTH = PLANNER.grasp_depth
-"""The depth of the pads below the tool's top."""
+"""The depth of the pads' lower edges below the tool's top."""
 FLOOR_CLEARANCE = PLANNER.floor_clearance
 """The least height of the pads above the table."""
 WIDEST = MAX_OPENING - 0.015
-"""The largest width to grasp, which leaves a margin on either side."""
+"""The largest width to grasp; it leaves a margin on either side of the tool."""
 NARROWEST = 0.003
 """The smallest width to grasp."""
 RELEASE_REACH = PLANNER.release_clearance + FINGERTIP_DEPTH
-"""The reach of the fingertips beyond the gripped faces when they release."""
+"""The distance beyond the gripped faces that the fingertips need when they release."""
 
-# A pad touches the surface that lies less than this behind the foremost surface: in the fine search
-# and in the coarse one.
+# A pad touches the surface up to this depth behind the foremost point: first in the fine search,
+# then in the coarse one.
 _TOUCH = 0.0003
 _COARSE_TOUCH = 0.0008
-# The hand's upper fingers are set back from its pads by this much.
+# The distance by which the upper fingers are set back from the pads.
 _FINGER_RECESS = 0.003
-# Faces that narrow upward at more than this angle slip out of the pads.
+# The inward lean of a face above which it slips out of the pads, in radians.
 _STEEPEST = np.radians(28.0)
-# The least share of the pads' length that touches on both sides, except in a grasp by a corner.
+# The least share of the pads' length along which both must touch, except at a corner.
 _LEAST_CONTACT = 0.15
-# The distance from the middle of a tool in its kit to a neighbour.
+# The distance from the middle of a tool in its kit to a neighbouring tool.
 _LANE = 0.040
 
 _BIN, _STEP = 0.0005, 0.001
 _COARSE_DEG, _FINE_DEG = 5.0, 0.5
 _MOST_PROPOSALS = 12
-# Proposals this close to a better one are dropped.
+# A proposal is dropped if it is this close to a better one.
 _DISTINCT, _DISTINCT_ANGLE = 0.012, np.radians(20.0)
 
 
 @dataclass(frozen=True)
 class GraspProposal(Grasp):
-    """A grasp in frame T with the measures that rank it."""
+    """A grasp in frame T, with the measures by which proposals are ranked."""
 
     offset: float
     """The horizontal distance between the centre of mass and the grasp, in metres."""
     contact: float
     """The share of the pads' length, 0 to 1, along which both touch."""
     depth: float
-    """The share of the pads' depth below the tool's top, 0 to 1, over which both touch."""
+    """The share of the pads' height below the tool's top, 0 to 1, over which both touch."""
     slope: float
     """The inward lean of the gripped faces at the pads' lower edges, in radians."""
     overhang: float
-    """The distance that the tool stands out past the gripped faces at the fingers, in metres."""
+    """The distance by which the tool stands out beyond the gripped faces at the fingers, in
+    metres."""
     penalties: dict[str, float] = field(default_factory=dict)
-    """The terms of the cost by cause."""
+    """The terms of the cost, by cause."""
 
     @property
     def cost(self) -> float:
@@ -77,7 +79,7 @@ class GraspProposal(Grasp):
 
     @property
     def grasp(self) -> Grasp:
-        """The grasp alone."""
+        """The grasp without its measures."""
         return Grasp(self.x, self.y, self.theta, self.width, self.surface_height)
 
 
@@ -88,18 +90,19 @@ def propose_grasps(
     *,
     corners: bool = False,
 ) -> list[GraspProposal]:
-    """Grasps from above, best first; empty if the hand cannot hold the tool.
+    """Proposes grasps from above, best first; returns none if the hand cannot hold the tool.
 
-    A triangle, a pentagon or a star has no two faces for the pads. It is held at a corner: a soft
-    pad yields to the corner, and the face (or the two points) under the other pad keeps the tool
-    from turning.
+    A triangle, a pentagon or a star has no two parallel faces for the pads, and is held at a
+    corner. The soft pad yields to the corner, and the face or the two points under the other pad
+    keep the tool from turning.
 
     Args:
         triangles: (n, 3, 3) the surface in frame T, in metres, with the table at z = 0.
         center_of_mass: (2,) or (3,) in T, in metres.
-        planner: gives the pads' depth, their clearance to the table, and the release clearance.
+        planner: the planner's parameters; the pads' depth, their clearance to the table and the
+            release clearance are used.
         corners: whether grasps at a corner compete with those between faces. If not, they are
-            proposed only for a tool without any other.
+            proposed only for a tool that has no other grasp.
     """
     found = _propose(triangles, center_of_mass, planner, corners=corners)
     return found or _propose(triangles, center_of_mass, planner, corners=True)
@@ -108,7 +111,7 @@ def propose_grasps(
 def _propose(
     triangles: Array, center_of_mass: Array, planner: PickPlaceParameters, *, corners: bool
 ) -> list[GraspProposal]:
-    """`propose_grasps`, with or without grasps at a corner."""
+    """Does the work of `propose_grasps`, either with grasps at a corner or without."""
     height = float(triangles[:, :, 2].max())
     if not height > planner.floor_clearance:
         return []
@@ -118,7 +121,7 @@ def _propose(
         return []
     com = np.asarray(center_of_mass, dtype=float)[:2]
 
-    # A rotation by pi swaps the two jaws, which are alike.
+    # A rotation by pi only swaps the two jaws, which are alike.
     found: list[GraspProposal] = []
     for theta in np.radians(np.arange(-90.0, 90.0, _COARSE_DEG)):
         found += _search(points, level, levels, com, float(theta), _COARSE_TOUCH, planner, corners)
@@ -133,7 +136,7 @@ def _propose(
             )
         if near:
             result.append(min(near, key=lambda p: p.cost))
-    # The slices know heights only to their spacing.
+    # The slices resolve heights only to their spacing.
     result = [replace(p, surface_height=_top(triangles, p)) for p in result]
     return sorted(result, key=lambda p: p.cost)
 
@@ -149,7 +152,8 @@ def _levels(height: float) -> Array:
 
 
 def _slices(triangles: Array, levels: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Points (n, 2) on the outlines of the horizontal slices, and each point's level."""
+    """Returns points (n, 2) on the outlines of the horizontal slices, and the level (n) of each
+    point."""
     all_points, all_levels = [np.empty((0, 2))], [np.empty(0, dtype=np.int64)]
     low, high = triangles[:, :, 2].min(axis=1), triangles[:, :, 2].max(axis=1)
     for index, z in enumerate(levels):
@@ -171,22 +175,22 @@ def _slices(triangles: Array, levels: Array) -> tuple[Array, NDArray[np.int64]]:
 
 @dataclass(frozen=True)
 class _Reach:
-    """The extents of a tool to either side at each height, in the hand's coordinates.
+    """The extents of a tool to either side, at each height, in the hand's coordinates.
 
-    At one rotation of the hand, u is along the pads and v across them.
+    At a given rotation of the hand, u is the coordinate along the pads and v the one across them.
     """
 
     u_min: float
     """The u of the first column; each column is `_BIN` long."""
     left: Array
-    """(columns, levels) the greatest v; -inf where empty."""
+    """(columns, levels) the greatest v; -inf where the tool is absent."""
     right: Array
-    """(columns, levels) the least v; inf where empty."""
+    """(columns, levels) the least v; inf where the tool is absent."""
 
 
 @dataclass(frozen=True)
 class _Hold:
-    """The hold of two pads on a tool. Lengths in metres; see `GraspProposal`."""
+    """How two pads hold a tool; see `GraspProposal` for the measures. Lengths in metres."""
 
     middle: float
     """The v halfway between the gripped faces."""
@@ -199,10 +203,10 @@ class _Hold:
     twist: float
     """The distance along the pads between the two pads' mean points of contact."""
     corner: float = 0.0
-    """The cost of holding a corner; 0 between two faces."""
+    """The cost of holding a corner; 0 for a hold between two faces."""
 
 
-# Columns to either side of the middle.
+# The number of columns to either side of the middle.
 _PAD_COLUMNS = round(PAD_LENGTH / 2 / _BIN)
 _FINGER_COLUMNS = round(FINGER_LENGTH / 2 / _BIN)
 
@@ -234,9 +238,18 @@ def _search(
     corners: bool,
     near: Array | None = None,
 ) -> list[GraspProposal]:
-    """The acceptable grasps at one rotation of the hand, along the whole tool or close to `near`.
+    """Returns the acceptable grasps at one rotation of the hand.
 
-    A pad touches the surface that lies less than `touch` behind the foremost surface.
+    Args:
+        points: (n, 2) points of the slices.
+        level: (n) the level of each point.
+        levels: the heights of the slices, in metres.
+        com: (2,) the centre of mass in T, in metres.
+        theta: the rotation of the hand, in radians.
+        touch: the depth behind the foremost point up to which a pad touches, in metres.
+        planner: the planner's parameters.
+        corners: whether a corner may be held.
+        near: (2,) the point in T close to which to search; None searches along the whole tool.
     """
     reach = _reach(points, level, levels, theta)
     first, last = _FINGER_COLUMNS, len(reach.left) - _FINGER_COLUMNS
@@ -257,7 +270,7 @@ def _search(
 def _proposal(
     hold: _Hold, u: float, theta: float, com: Array, planner: PickPlaceParameters
 ) -> GraspProposal:
-    """The proposal of a hold with the pads' middle at `u`, with its penalties."""
+    """Makes the proposal of a hold with the pads' middle at `u`, with its penalties."""
     along, across = jaw_axes(theta)
     x, y = u * along + hold.middle * across
     lever = abs(u - float(com @ along))
@@ -304,17 +317,22 @@ def _hold(
     planner: PickPlaceParameters,
     corners: bool,
 ) -> _Hold | None:
-    """How two pads hold the tool when they are centred on a column; None if they cannot.
+    """Describes how two pads hold the tool when they are centred on a column.
 
-    `find_grip` measures only the distance between the pads; this also measures their contact.
+    `find_grip` measures only the distance between the pads. This function also measures their
+    contact.
 
     Args:
-        reach: the reach of the tool.
-        centre: the pads' middle is at the lower edge of this column.
-        levels: the heights of the slices.
-        touch: a pad touches the surface that lies less than this behind the foremost surface.
-        planner: gives the pads' depth and their clearance to the table.
+        reach: the extents of the tool.
+        centre: the column at whose lower edge the pads' middle is.
+        levels: the heights of the slices, in metres.
+        touch: the depth behind the foremost point up to which a pad touches, in metres.
+        planner: the planner's parameters; the pads' depth and their clearance to the table are
+            used.
         corners: whether a corner may be held.
+
+    Returns:
+        The hold, or None if the pads cannot hold the tool.
     """
     fingers = slice(centre - _FINGER_COLUMNS, centre + _FINGER_COLUMNS)
     finger_left, finger_right = reach.left[fingers], reach.right[fingers]
@@ -334,7 +352,7 @@ def _hold(
     width = furthest_left - furthest_right
     if not NARROWEST <= width <= WIDEST:
         return None
-    # The fingers pass the tool from its top down to the pads' ends.
+    # The fingers pass all levels from the tool's top down to the pads' lower edges.
     passed = levels >= bottom
     overhang = max(
         finger_left[:, passed].max() - furthest_left,
@@ -374,11 +392,11 @@ def _hold(
 
 
 def _lean(profile: Array, step: float) -> float:
-    """By how much a face leans inward at a pad's lower edge, in radians.
+    """Returns the inward lean of a face at a pad's lower edge, in radians.
 
     Args:
-        profile: how far the face reaches out at each level, from the lowest one up.
-        step: the distance of the levels, in metres.
+        profile: how far the face stands out at each level, from the lowest level up, in metres.
+        step: the distance between levels, in metres.
     """
     above = min(2, len(profile) - 1)
     if above == 0 or profile.argmax() > 0 or not np.isfinite(profile[above]):

@@ -1,1 +1,1 @@
-"""Flat shapes to assemble in kits: our own, and a user's meshes."""
+"""Flat shapes to assemble in kits: the project's own shapes, and a user's meshes."""

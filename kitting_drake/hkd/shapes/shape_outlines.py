@@ -1,7 +1,8 @@
 """The outlines of the project's twenty flat shapes, in mm.
 
-All are 30 to 75 mm by 45 to 60 mm, like the shapes of Ravens' assembling-kits. Features are wide
-enough to be seen in o_t and to survive in the cavity, which bridges narrow notches.
+All are 30 to 75 mm by 45 to 60 mm in size, like the shapes of Ravens' assembling-kits task. Their
+features are wide enough to be seen in the observation o_t, and wider than the notches that a cavity
+bridges.
 """
 
 import math
@@ -14,9 +15,9 @@ from manifold3d import CrossSection, JoinType
 from kitting_drake.hkd.tools.symmetry import ORDERS
 
 HEIGHT_MM = 20.0
-"""The height of the shapes."""
+"""The height of the shapes, in mm."""
 ROUND = ORDERS[0]
-"""The symmetry of a shape that looks alike at any heading."""
+"""The order of symmetry of a shape that looks the same at any heading."""
 
 _ARC = 96
 """The number of edges of a full circle."""
@@ -24,13 +25,13 @@ _ARC = 96
 
 @dataclass(frozen=True)
 class OutlinedShape:
-    """One of the project's shapes."""
+    """One of the project's flat shapes."""
 
     name: str
     split: str
-    """`train` or `test`."""
+    """The split: `train` or `test`."""
     draw: Callable[[], CrossSection]
-    """Makes the outline, in mm."""
+    """A function that draws the outline, in mm."""
     symmetry: int = 1
     """The order of the rotational symmetry; `ROUND` for any rotation."""
 
@@ -48,13 +49,14 @@ def _polygon(*points: tuple[float, float]) -> CrossSection:
 
 
 def _rounded(outline: CrossSection, radius: float) -> CrossSection:
-    """Rounds the convex corners."""
+    """Rounds the convex corners of an outline."""
     inner = outline.offset(-radius, JoinType.Miter, miter_limit=4.0)
     return inner.offset(radius, JoinType.Round, circular_segments=_ARC)
 
 
 def _star(points: int, outer: float, inner: float) -> CrossSection:
-    """A star with a point toward +y; a regular polygon if `inner` is on its sides."""
+    """Draws a star with a point toward +y; if `inner` is on the sides of a polygon, it is that
+    polygon."""
     angles = math.pi / 2 + np.arange(2 * points) * math.pi / points
     radii = np.where(np.arange(2 * points) % 2, inner, outer)
     return CrossSection([np.column_stack([radii * np.cos(angles), radii * np.sin(angles)])])
@@ -65,7 +67,7 @@ def _regular(sides: int, radius: float) -> CrossSection:
 
 
 def _turned(part: CrossSection, count: int) -> CrossSection:
-    """The union of a part and its rotations about the origin."""
+    """Returns the union of a part and its `count` - 1 rotations about the origin."""
     result = CrossSection()
     for step in range(count):
         result += part.rotate(360.0 * step / count)

@@ -1,7 +1,7 @@
-"""Makes tools of flat shapes, in the cache: the project's own, and meshes of a folder.
+"""Makes tools of flat shapes, in the cache: the project's own shapes, and the meshes of a folder.
 
-A shape lies as it was drawn, with z up. All shapes are of plastic, and each has a colour of its
-own. Its collision hulls follow its outline and keep its holes.
+A shape lies as it was drawn, with z up. All shapes are of plastic, each in its own colour. The
+collision hulls follow the outline and keep its holes.
 """
 
 import hashlib
@@ -39,31 +39,32 @@ RAVENS_SCALE = (0.003, 0.003, 0.001)
 """The scale of the meshes of Ravens' assembling-kits, in metres per unit along x, y and z."""
 
 _FORMAT_VERSION = "1"
-"""Part of the cache key. Change it when equal inputs give other files."""
+"""The version of the files in the cache. Increase it when equal inputs give different files."""
 _DENSITY = 1150.0
-"""In kg/m^3."""
+"""The density of the shapes, in kg/m^3."""
 _COLOURS = ("red_grip", "blue_grip", "yellow_grip", "green_grip", "orange_grip", "hickory")
 _LARGEST_MM = 250.0
 _TIPS_DEG = 10.0
-"""A shape that tips over when the table tilts by less than this is not flat."""
+"""The tilt of the table, in degrees, at which a flat shape must not tip over."""
 _CREASE_DEG = 35.0
-# The solid is a prism if its volume and that of its outline differ by less than this share.
+# A solid counts as a prism if its volume differs from that of its extruded outline by less than
+# this share.
 _PRISM = 0.01
-# The tolerances of the collision hulls' outline to try until they are few enough; the tolerance of
-# its holes, and that for thinning vertices.
+# The tolerances of the collision hulls' outline, tried in turn until the hulls are few enough. Then
+# the tolerance of the shape's holes, and the tolerance for thinning vertices.
 _OUTLINES_MM, _HOLE_MM, _VERTEX_MM = (0.12, 0.2, 0.3), 0.8, 0.08
 _MOST_HULLS = 12
 _BESIDE = 0.025
-"""A grasp this far beside the centre of mass costs 1 more, in metres."""
+"""The distance of a grasp from the centre of mass, in metres, that adds 1 to its cost."""
 
 
 def shapes_of(split: str) -> list[OutlinedShape]:
-    """The project's shapes of a split, `train` or `test`."""
+    """Returns the project's shapes of a split, `train` or `test`."""
     return [shape for shape in SHAPES if shape.split == split]
 
 
 def shape_tool(shape: OutlinedShape) -> Tool:
-    """The tool of one of the project's shapes; it is made at the first call.
+    """Returns the tool of one of the project's shapes; makes it at the first call.
 
     Raises:
         UserError: the cache cannot be written.
@@ -82,7 +83,7 @@ def shape_tool(shape: OutlinedShape) -> Tool:
 
 
 def shape_files(folder: Path) -> list[Path]:
-    """The meshes in a folder, sorted by name.
+    """Returns the meshes in a folder, sorted by name.
 
     Raises:
         UserError: there is no such folder, or no mesh in it.
@@ -97,11 +98,11 @@ def shape_files(folder: Path) -> list[Path]:
 
 
 def imported_shape(path: Path, scale: Sequence[float] = RAVENS_SCALE) -> Tool:
-    """The tool of a mesh of a flat shape that lies with z up; it is made at the first call.
+    """Returns the tool of a flat shape's mesh, which lies with z up; makes it at the first call.
 
     Args:
         path: the mesh.
-        scale: metres per unit of the file along x, y and z.
+        scale: metres per unit of the file, along x, y and z.
 
     Raises:
         UserError: the mesh is unreadable, or is not a flat shape that the hand can hold; or the
@@ -127,9 +128,9 @@ def imported_shape(path: Path, scale: Sequence[float] = RAVENS_SCALE) -> Tool:
 
 
 def _solid(path: Path, scale: Sequence[float]) -> Manifold:
-    """The solid of a mesh, in mm."""
+    """Returns the solid of a mesh, in mm."""
     vertices, faces = read_mesh(path)
-    # Repair has tolerances for a solid of this size.
+    # Scale the mesh for repair, whose tolerances are for a solid of this size.
     vertices = 1e3 * np.asarray(scale) * vertices
     extent = float(np.ptp(vertices, axis=0).max())
     if not 1e-9 < extent < np.inf:
@@ -156,8 +157,8 @@ def _write(
         name: the tool's name.
         split: the tool's split.
         solid: the shape at rest, in mm.
-        colour: its material, a key of `MATERIALS`.
-        symmetry: the order of its symmetry; None to measure it.
+        colour: the shape's material, a key of `MATERIALS`.
+        symmetry: the order of the rotational symmetry; None to measure it.
 
     Raises:
         UserError: the solid is not a flat shape that the hand can hold.
@@ -170,7 +171,7 @@ def _write(
     proposals = propose_grasps(triangles, center, corners=True)
     if not proposals:
         raise UserError(
-            f"the hand cannot hold it from above (the jaws hold at most {1e3 * WIDEST:.0f} mm)"
+            f"the hand cannot hold it from above (the jaws open to at most {1e3 * WIDEST:.0f} mm)"
         )
     grasp = min(proposals, key=_rank).grasp
     meshes.write_smooth_obj(folder / f"{colour}.obj", solid, _CREASE_DEG)
@@ -198,10 +199,10 @@ def _write(
 
 
 def _rank(proposal: GraspProposal) -> float:
-    """The cost of a grasp of a shape.
+    """Returns the cost of a grasp of a shape.
 
-    The places of shapes are far apart, so neighbours in the kit do not matter. The centre of mass
-    matters more than in a hand tool, because a shape has no handle: its ends hardly fill the pads.
+    Shapes are far apart in their kit, so the penalty for neighbours is left out. The centre of mass
+    counts more than for a hand tool: a shape has no handle, and its ends hardly fill the pads.
     """
     beside = proposal.offset / _BESIDE
     return proposal.cost - proposal.penalties["neighbour in the kit"] + beside
@@ -211,8 +212,8 @@ def _check(solid: Manifold) -> None:
     length, width, height = size(solid)
     if max(length, width) > _LARGEST_MM:
         raise UserError(
-            f"it is {max(length, width):.0f} mm long, and a shape can have {_LARGEST_MM:.0f} mm: "
-            "give another scale"
+            f"it is {max(length, width):.0f} mm long, and a shape can have at most "
+            f"{_LARGEST_MM:.0f} mm: give another scale"
         )
     if not THINNEST_MM <= height <= HIGHEST_MM:
         raise UserError(
@@ -220,11 +221,13 @@ def _check(solid: Manifold) -> None:
             f"{HIGHEST_MM:.0f} mm: give another scale"
         )
     if tipping_deg(solid) < _TIPS_DEG:
-        raise UserError("it does not lie flat: turn it so that it rests on the plane of x and y")
+        raise UserError(
+            "it does not lie flat: turn it so that its flat side is in the plane of x and y"
+        )
 
 
 def _hulls(solid: Manifold, grasp: Grasp) -> list[np.ndarray]:
-    """Convex hulls (n, 3) that fill a shape, in mm. Those of a prism leave its holes open."""
+    """Makes convex hulls (n, 3) in mm that fill a shape; those of a prism leave its holes open."""
     height = float(size(solid)[2])
     outline = solid.project().simplify(0.01)
     prism = abs(outline.area() * height - solid.volume()) < _PRISM * solid.volume()

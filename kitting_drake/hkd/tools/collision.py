@@ -1,8 +1,8 @@
-"""Merges the convex hulls that fill a solid into few collision hulls.
+"""Merges many small convex hulls that fill a solid into few collision hulls.
 
-Lengths are in mm. A hull is an array (n, 3) of points and stands for their convex hull. Merging is
-limited by the projections of the result: the xy outline decides whether the tool fits its cavity,
-and the xz and yz heights decide how it rests.
+Lengths are in mm. A hull is given by points (n, 3), whose convex hull it is. The projections of the
+result limit the merging: the xy outline decides whether the tool fits its cavity, and the xz and yz
+profiles decide how it rests.
 """
 
 import itertools
@@ -19,14 +19,15 @@ from kitting_drake.hkd.tools.solids import SEGMENTS
 GRID_MM = 0.05
 
 _XY, _XZ, _YZ = [0, 1], [0, 2], [1, 2]
-# A first pass merges hulls that change by less than this, to leave fewer for the search.
+# A first pass merges hulls whose projections change by less than this, to leave fewer hulls for the
+# search.
 _EXACT_MM = 0.03
-# Area (mm^2) below which outlines count as equal.
+# Area (mm^2) below which two outlines count as equal.
 _AREA = 1e-4
 
 
 def projection(hulls: Sequence[np.ndarray], plane: Sequence[int] = _XY) -> CrossSection:
-    """The projection of a union of convex hulls onto a coordinate plane."""
+    """Returns the projection of a union of convex hulls onto a coordinate plane."""
     return CrossSection.batch_boolean(
         [CrossSection.hull_points(np.ascontiguousarray(h[:, plane])) for h in hulls],
         manifold3d.OpType.Add,
@@ -34,7 +35,8 @@ def projection(hulls: Sequence[np.ndarray], plane: Sequence[int] = _XY) -> Cross
 
 
 def closed(profile: CrossSection, clearance: float) -> CrossSection:
-    """The profile with its holes filled and its gaps under twice the clearance closed."""
+    """Fills the holes of a profile, and closes its gaps that are narrower than twice the
+    clearance."""
 
     def outer(p: CrossSection) -> CrossSection:
         return CrossSection([loop for loop in p.to_polygons() if CrossSection([loop]).area() > 0])
@@ -46,12 +48,12 @@ def closed(profile: CrossSection, clearance: float) -> CrossSection:
 def furthest(
     inner: CrossSection, outer: CrossSection, precision: float = 0.01, area: float = _AREA
 ) -> float:
-    """The largest distance of a point of `inner` from `outer`, capped at 5 mm.
+    """Returns the largest distance of a point of `inner` from `outer`, at most 5 mm.
 
     Args:
-        inner, outer: in mm.
-        precision: of the distance, in mm.
-        area: parts of `inner` smaller than this (mm^2) do not count.
+        inner, outer: two regions, in mm.
+        precision: the precision of the distance, in mm.
+        area: the area in mm^2 below which parts of `inner` are ignored.
     """
     low, high = 0.0, 5.0
     while high - low > precision:
@@ -67,15 +69,15 @@ def thinned(
     outline_tolerance: float | None = None,
     grid: float = GRID_MM,
 ) -> np.ndarray:
-    """Selects vertices (m, 3) whose hull is within about `tolerance` of the hull of `points`.
+    """Selects few vertices (m, 3) whose hull is within about `tolerance` of the hull of `points`.
 
-    Points on the table are selected first, so that a flat bottom stays flat. The result is snapped
-    to a grid, which makes nearly coplanar facets exactly coplanar or clearly different.
+    Points on the table are selected first, so that a flat bottom stays flat. The result is rounded
+    to a grid. Facets that are nearly in one plane are then exactly in one plane or clearly not.
 
     Args:
         points: (n, 3) in mm.
-        tolerance: in mm.
-        outline_tolerance: a tolerance for the outline from above, in mm; `tolerance` if None.
+        tolerance: the largest distance between the hulls, in mm.
+        outline_tolerance: the tolerance for the outline from above, in mm; `tolerance` if None.
         grid: the spacing of the grid in mm.
     """
     points = points[ConvexHull(points).vertices]
@@ -91,12 +93,13 @@ def thinned(
 
 
 def _farthest(points: np.ndarray, chosen: list[int], tolerance: float) -> list[int]:
-    """Adds farthest points to `chosen` until the hull is within tolerance; sorts the indices."""
+    """Adds farthest points to `chosen` until the hull is within tolerance; returns sorted
+    indices."""
     dimension = points.shape[1]
     directions = np.array(np.meshgrid(*[[-1.0, 0.0, 1.0]] * dimension)).reshape(dimension, -1).T
     chosen = list(dict.fromkeys([*chosen, *np.argmax(points @ directions.T, axis=0)]))
     if len(chosen) <= dimension:
-        # Too few extreme points to span a hull: keep all.
+        # Keep all points if they are too few to span a hull.
         return list(range(len(points)))
     while True:
         equations = ConvexHull(points[chosen], qhull_options="QJ Pp").equations
@@ -108,7 +111,7 @@ def _farthest(points: np.ndarray, chosen: list[int], tolerance: float) -> list[i
 
 
 class _Hull:
-    """A convex hull, the hulls that it was merged from, its volume and its bounding box."""
+    """A convex hull with its volume, its bounding box, and the hulls from which it was merged."""
 
     def __init__(self, points: np.ndarray, sources: list[np.ndarray] | None = None):
         hull = Manifold.hull_points(np.ascontiguousarray(points))
@@ -129,7 +132,8 @@ def _grown(profile: CrossSection, distance: float) -> CrossSection:
 
 
 def _fits(hull: _Hull, allowed: CrossSection, tolerance: float) -> bool:
-    """Whether a merged hull stays in `allowed` on xy and keeps its sources' other projections."""
+    """Whether a merged hull stays in `allowed` on xy, and keeps the other projections of its
+    sources."""
     if (projection([hull.points]) - allowed).area() > _AREA:
         return False
     return all(
@@ -142,7 +146,8 @@ def _fits(hull: _Hull, allowed: CrossSection, tolerance: float) -> bool:
 
 
 def _merged(hulls: list[_Hull], allowed: CrossSection, tolerance: float) -> list[_Hull]:
-    """Merges pairs in order of the least added volume until no pair fits."""
+    """Merges pairs of hulls, in order of the least added volume, until no merged pair is
+    allowed."""
     alive = dict(enumerate(hulls))
 
     def options(a: int, b: int) -> list[tuple[float, int, int]]:
@@ -165,12 +170,12 @@ def _merged(hulls: list[_Hull], allowed: CrossSection, tolerance: float) -> list
 def cover(
     hulls: Sequence[np.ndarray], outline: CrossSection, allowed: CrossSection, tolerance: float
 ) -> list[np.ndarray]:
-    """Covers `hulls` with few convex hulls, which may overlap. Deterministic.
+    """Covers `hulls` with few convex hulls, which may overlap. The result is deterministic.
 
-    Every hull is a seed that grows by the neighbour that adds the least volume. Its xy projection
-    must stay within `allowed`, and the other projections may grow by at most `tolerance` (mm). Then
-    the grown hull that covers the most uncovered volume is selected until all of `hulls` are
-    covered. Finally, hulls that hardly change any projection are dropped.
+    Each hull is a seed that grows by the neighbour that adds the least volume. The xy projection of
+    the grown hull must stay within `allowed`; the other projections may grow by at most `tolerance`
+    (mm). Then grown hulls are selected, each the one that covers the most uncovered volume, until
+    all of `hulls` are covered. Finally, hulls that hardly change any projection are dropped.
     """
     merged = _merged([_Hull(h) for h in hulls], _grown(outline, _EXACT_MM), _EXACT_MM)
     grown = [_grow(seed, merged, allowed, tolerance) for seed in range(len(merged))]
@@ -180,7 +185,7 @@ def cover(
             round(sum(merged[i].volume for i in members & open_hulls), 3) for _, members in grown
         ]
         _, members = grown[int(np.argmax(gains))]
-        # Span only the uncovered members, since other hulls cover the rest.
+        # Span only the uncovered members, because other hulls cover the rest.
         wanted = np.vstack([merged[i].points for i in sorted(members & open_hulls)])
         result.append(wanted)
         open_hulls -= members
@@ -190,10 +195,15 @@ def cover(
 def runs(
     sections: Sequence[np.ndarray], tolerance: float, height_tolerance: float
 ) -> list[np.ndarray]:
-    """Merges the sections (n, 3) of a loft into few long hulls.
+    """Merges the sections of a loft into few long hulls.
 
-    Neighbours are merged while the xy projection grows by at most `tolerance` and the other two,
-    which matter less for a cavity, by at most `height_tolerance` (both in mm).
+    Neighbouring sections are merged as long as the projections grow little. The xy projection has
+    the smaller tolerance, because it decides whether the tool fits its cavity.
+
+    Args:
+        sections: the points (n, 3) of each section, in mm.
+        tolerance: the largest growth of the xy projection, in mm.
+        height_tolerance: the largest growth of the other two projections, in mm.
     """
     pairs = [np.vstack(pair) for pair in itertools.pairwise(sections)]
     result, first = [], 0
@@ -219,7 +229,7 @@ def runs(
 
 
 def _pruned(hulls: list[np.ndarray], tolerance: float) -> list[np.ndarray]:
-    """Drops hulls, smallest first, if no projection shrinks by more than `tolerance`."""
+    """Drops hulls, smallest first, as long as no projection shrinks by more than `tolerance`."""
     wholes = [projection(hulls, plane) for plane in (_XY, _XZ, _YZ)]
     kept = list(hulls)
     for hull in sorted(hulls, key=lambda h: Manifold.hull_points(h).volume()):
@@ -235,7 +245,8 @@ def _pruned(hulls: list[np.ndarray], tolerance: float) -> list[np.ndarray]:
 def _grow(
     seed: int, hulls: list[_Hull], allowed: CrossSection, tolerance: float
 ) -> tuple[np.ndarray, set[int]]:
-    """Grows the largest hull from `seed`; returns its points and the indices of its members."""
+    """Grows the largest allowed hull from a seed; returns its points and the indices of its
+    members."""
     current, members = hulls[seed], {seed}
     candidates = set(range(len(hulls))) - members
     while True:
@@ -244,7 +255,7 @@ def _grow(
             (current.joined(hulls[i]).volume - current.volume - hulls[i].volume, i) for i in near
         )
         for _, i in trials:
-            # The hull only grows, so a neighbour that does not fit here never will.
+            # The hull only grows, so a neighbour that does not fit at this step never will.
             candidates.discard(i)
             joined = current.joined(hulls[i])
             if _fits(joined, allowed, tolerance):

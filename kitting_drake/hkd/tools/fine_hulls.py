@@ -1,7 +1,7 @@
 """Collision hulls that follow a tool's outline closely, for cavities with little clearance.
 
-Lengths are in mm. The outline from above is cut into convex cells, and each hull is that of the
-solid in the prism over a cell. So no hull sticks out beyond the outline.
+Lengths are in mm. The outline from above is cut into convex cells. Each hull is the hull of the
+part of the solid above or below one cell, so no hull sticks out beyond the outline.
 """
 
 from collections.abc import Sequence
@@ -15,40 +15,43 @@ from kitting_drake.hkd.tools.collision import furthest, projection, thinned
 Array = NDArray[np.float64]
 
 INSIDE_MM = 0.04
-"""The hulls' outline is at most this far inside the true one."""
+"""The largest distance of the hulls' outline inside the true outline, in mm."""
 NOTCH_MM = 3.0
-"""Hulls bridge notches narrower than twice this, because cavities do so too."""
+"""Half the width of the notches that hulls may bridge, in mm. Cavities bridge them too."""
 _HEIGHT_MM = 0.2
-"""The tolerance for thinning a hull's vertices; its outline has a finer one."""
+"""The tolerance in mm for thinning a hull's vertices; the outline has a finer one."""
 _AREA = 2e-3
-"""Area (mm^2) below which outlines count as equal."""
-# A piece is cut at a height if that removes more than this share and volume (mm^3) of its hull.
+"""Area (mm^2) below which two outlines count as equal."""
+# A piece is cut at a height if the cut makes its hull smaller by more than this share and this
+# volume (mm^3). Then the number of heights to try, and the largest number of cuts.
 _SHARE, _VOLUME, _LEVELS, _MOST_CUTS = 0.08, 8.0, 9, 2
 _TIP = 1.0
-"""Tips that cells can be extended to are closer than this, in mm."""
+"""The distance in mm within which a cell can be extended to a tip of the outline."""
 _THINNEST_MM = 0.6
-"""The least height of a cut piece."""
+"""The least height of a cut piece, in mm."""
 
 
 def fine_hulls(
     parts: Sequence[Array], notch: float = NOTCH_MM, inside: float = INSIDE_MM
 ) -> list[Array]:
-    """Convex hulls, as points (n, 3) in mm, that fill a solid. Deterministic.
+    """Makes convex hulls, as points (n, 3) in mm, that fill a solid. The result is deterministic.
 
     Args:
         parts: the closed surfaces of the solid's parts, as triangles (n, 3, 3) in mm.
-        notch: hulls may bridge notches narrower than twice this, and fill such holes, in mm.
-        inside: the largest distance of the hulls' outline inside the true one, in mm. They are at
-            most half of it outside.
+        notch: half the width, in mm, of the notches and holes that hulls may bridge.
+        inside: the largest distance, in mm, of the hulls' outline inside the true one. Outside, the
+            largest distance is half of it.
 
     Raises:
         ValueError: a surface is not closed.
     """
     solid = Manifold.batch_boolean([_solid(part) for part in parts], OpType.Add)
     outline = CrossSection(solid.project().to_polygons())
-    # The grid's steps are large enough for Drake, which refuses facets below about 1e-10 m^2.
+    # Drake refuses facets with areas below about 1e-10 m^2; the grid is coarse enough to avoid
+    # them.
     grid = inside / 2
-    # The outline is moved inside, simplified to both sides of that, and then loses vertices.
+    # Three steps each use up a third of `inside`: the outline is moved inward, simplified, and
+    # loses vertices.
     third = inside / 3
     inner = outline.offset(-third, JoinType.Round, circular_segments=64).simplify(third)
     outer = without_notches(outline, notch)
@@ -67,12 +70,16 @@ def fine_hulls(
 def plan_deviation(
     hulls: Sequence[Array], outline: CrossSection, notch: float = NOTCH_MM
 ) -> tuple[float, float]:
-    """How far the outline of hulls is outside and inside the true one, in mm, to 0.001 mm.
+    """Measures how far the outline of hulls is outside and inside the true one.
 
     Args:
         hulls: points (n, 3) in mm.
         outline: the true outline from above, in mm.
-        notch: outside counts from the outline without notches and holes narrower than twice this.
+        notch: half the width, in mm, of the notches and holes whose bridging does not count as
+            outside.
+
+    Returns:
+        The largest distances outside and inside, in mm, with a precision of 0.001 mm.
     """
     covered = projection(hulls)
     return (
@@ -95,17 +102,18 @@ def _solid(triangles: Array) -> Manifold:
 
 
 def without_notches(outline: CrossSection, notch: float) -> CrossSection:
-    """The outline without notches and holes narrower than twice `notch`."""
+    """Fills an outline's notches and holes that are narrower than twice `notch`."""
     grown = outline.offset(notch, JoinType.Round, circular_segments=192)
-    # Offsetting back in chords would shave the corners: add the original.
+    # Offsetting outward and back shaves off corners, so add the original outline.
     return grown.offset(-notch, JoinType.Round, circular_segments=192) + outline
 
 
 def convex_cells(inner: CrossSection, outer: CrossSection) -> list[CrossSection]:
-    """Few convex polygons that cover `inner` and stay within `outer`. They may overlap.
+    """Covers the region `inner` with few convex polygons that stay within `outer` and may overlap.
 
-    The largest uncovered triangle of `inner` grows by neighbours while their hull is within
-    `outer`. The cell is the hull of its uncovered triangles.
+    The largest uncovered triangle of `inner` grows by neighbouring triangles as long as their hull
+    is within `outer`. The cell is the hull of those of them that were uncovered. This repeats until
+    all triangles are covered.
     """
     loops = inner.to_polygons()
     corners = np.vstack(loops)
@@ -125,7 +133,7 @@ def convex_cells(inner: CrossSection, outer: CrossSection) -> list[CrossSection]
 
 
 def _neighbours(faces: NDArray[np.int_]) -> list[set[int]]:
-    """The triangles that share an edge with each triangle."""
+    """Returns for each triangle the set of triangles that share an edge with it."""
     owners: dict[tuple[int, int], list[int]] = {}
     for index, face in enumerate(faces.tolist()):
         for a, b in zip(face, face[1:] + face[:1], strict=True):
@@ -140,7 +148,7 @@ def _neighbours(faces: NDArray[np.int_]) -> list[set[int]]:
 def _grow(
     seed: int, flat: Array, neighbours: list[set[int]], areas: Array, outer: CrossSection
 ) -> set[int]:
-    """The triangles of the largest convex cell around a triangle."""
+    """Returns the indices of the triangles of the largest convex cell around a triangle."""
     members, refused = {seed}, set[int]()
     points = flat[seed]
     while True:
@@ -151,7 +159,7 @@ def _grow(
         trial = np.vstack([points, flat[index]])
         hull = CrossSection.hull_points(trial)
         if (hull - outer).area() > _AREA:
-            # The cell only grows, so a triangle that does not fit here never will.
+            # The cell only grows, so a triangle that does not fit at this step never will.
             refused.add(index)
             continue
         members.add(index)
@@ -159,7 +167,7 @@ def _grow(
 
 
 def _needed(cells: list[CrossSection], inner: CrossSection) -> list[CrossSection]:
-    """Drops cells, smallest first, that the others cover."""
+    """Drops cells, smallest first, that are covered by the others."""
     kept = list(cells)
     for cell in sorted(cells, key=lambda c: c.area()):
         rest = [other for other in kept if other is not cell]
@@ -171,9 +179,9 @@ def _needed(cells: list[CrossSection], inner: CrossSection) -> list[CrossSection
 def _with_tips(
     cells: list[CrossSection], outline: CrossSection, outer: CrossSection, tolerance: float
 ) -> list[CrossSection]:
-    """Extends cells to the corners of the outline that are farther than a tolerance from all.
+    """Extends cells to corners of the outline that are farther than a tolerance from all cells.
 
-    The inner outline recedes from sharp tips.
+    Such corners exist at sharp tips, where the inner outline lies far inside the true one.
     """
     cells = list(cells)
     near = CrossSection.batch_boolean(cells, OpType.Add).offset(
@@ -196,7 +204,8 @@ def _with_tips(
 
 
 def _cut_heights(piece: Manifold, cuts: int) -> list[Manifold]:
-    """Cuts a piece at the heights where that makes its hull smaller, as below a bolt's head."""
+    """Cuts a piece at the heights where cutting makes its hull smaller, for instance below a bolt's
+    head."""
     low, high = piece.bounding_box()[2], piece.bounding_box()[5]
     whole = piece.hull().volume()
     if not cuts or whole - piece.volume() < max(_SHARE * whole, _VOLUME):

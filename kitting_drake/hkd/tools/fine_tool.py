@@ -16,28 +16,29 @@ from kitting_drake.hkd.tools.meshes import write_convex_obj
 from kitting_drake.hkd.tools.tool import Tool
 
 _FORMAT_VERSION = "3"
-"""Part of the cache keys. Change it when equal inputs give other files."""
+"""The version of the files in the cache. Increase it when equal inputs give different files."""
 _STIFFER = 25.0
-"""The factor of the contact's modulus, so that walls do not sink in by more than the clearance."""
+"""The factor for the hydroelastic modulus. It keeps walls from sinking in by more than the
+clearance."""
 _LIST = "hulls.json"
 _DRAKE = "http://drake.mit.edu"
 
 
 def fine_tool(tool: Tool, closing_radius: float) -> Tool:
-    """The tool with finer and stiffer collision hulls (see `fine_hulls`).
+    """Returns a tool with finer and stiffer collision hulls (see `fine_hulls`).
 
-    Its model is in the cache. Everything else stays.
+    The model is in the cache. All other properties of the tool are unchanged.
 
     Args:
-        tool: may be scaled and weighted.
-        closing_radius: the cavity bridges notches narrower than twice this, in metres.
+        tool: the tool; it may be scaled and have another mass.
+        closing_radius: half the width, in metres, of the notches that the cavity bridges.
 
     Raises:
         UserError: the tool's surface is not closed, its model is not valid, or the cache cannot be
             written.
     """
-    # The hulls are those of the original size, so that tools scaled at random share them. The
-    # larger the tool, the finer they are, in steps.
+    # The hulls are made at the original size, so that randomly scaled tools share them. For larger
+    # scales they are finer, in steps of a factor of sqrt(2).
     finer = 2.0 ** (math.ceil(2 * math.log2(tool.scale) - 1e-9) / 2)
     notch = min(NOTCH_MM, 1e3 * closing_radius) / finer
     hulls = _hulls(tool, notch, INSIDE_MM / finer)
@@ -54,7 +55,7 @@ def fine_tool(tool: Tool, closing_radius: float) -> Tool:
 
 
 def _hulls(tool: Tool, notch: float, inside: float) -> list[Path]:
-    """The OBJ files of a tool's fine hulls, at the size of its meshes' files."""
+    """Returns the OBJ files of a tool's fine hulls, at the size of the tool's mesh files."""
     meshes = b"".join(path.read_bytes() for path in tool.visual_meshes)
 
     def write(folder: Path) -> None:
@@ -73,7 +74,7 @@ def _hulls(tool: Tool, notch: float, inside: float) -> list[Path]:
         )
     except ValueError as error:
         raise UserError(
-            f"the tool '{tool.name}' has no fine collision hulls: {error}: import its mesh again"
+            f"the tool '{tool.name}' has no fine collision hulls: {error}; import its mesh again"
         ) from error
     return [folder / name for name in json.loads((folder / _LIST).read_text())]
 
@@ -83,7 +84,7 @@ def _digest(content: bytes) -> str:
 
 
 def _with_hulls(tool: Tool, hulls: list[Path]) -> str:
-    """The tool's SDFormat text with other collision hulls."""
+    """Returns the tool's SDFormat text with the given collision hulls."""
     ElementTree.register_namespace("drake", _DRAKE)
     root = ElementTree.fromstring(tool.sdf.read_text())
     for mesh in root.iter("mesh"):

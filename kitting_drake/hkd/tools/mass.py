@@ -13,7 +13,8 @@ Body = tuple[Manifold, float]
 
 
 def mass_properties(bodies: Iterable[Body]) -> tuple[float, np.ndarray, np.ndarray]:
-    """Mass (kg), centre of mass (3,) in m, and inertia about it (3, 3) in kg m^2."""
+    """Returns the mass (kg), the centre of mass (3,) in m, and the inertia (3, 3) about it in kg
+    m^2."""
     single = []
     for solid, density in bodies:
         vertices, faces = vertices_and_faces(solid)

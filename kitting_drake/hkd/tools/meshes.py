@@ -1,4 +1,4 @@
-"""Writes solids as Wavefront OBJ in metres; equal solids give equal files."""
+"""Writes solids as Wavefront OBJ files in metres; equal solids give equal files."""
 
 from pathlib import Path
 
@@ -7,16 +7,18 @@ from manifold3d import Manifold
 
 
 def vertices_and_faces(solid: Manifold) -> tuple[np.ndarray, np.ndarray]:
-    """The surface's vertices (n, 3), in the solid's units, and faces (m, 3)."""
+    """Returns the vertices (n, 3) of a solid's surface, in the solid's units, and its faces (m,
+    3)."""
     mesh = solid.to_mesh64()
     return np.asarray(mesh.vert_properties)[:, :3], np.asarray(mesh.tri_verts).astype(int)
 
 
 def corner_normals(vertices: np.ndarray, faces: np.ndarray, crease_angle_deg: float) -> np.ndarray:
-    """The normals (m, 3, 3) of the faces' corners, smooth across edges below the crease angle.
+    """Computes normals (m, 3, 3) of the faces' corners, smooth across edges below the crease angle.
 
-    A corner's normal is the area-weighted mean over the faces at its vertex whose normals differ
-    from its own face's by less than that angle. So large flat faces stay flat beside narrow bevels.
+    A corner's normal is the area-weighted mean over faces at its vertex. Only those faces count
+    whose normals differ from the corner's own face by less than the crease angle. Large flat faces
+    therefore stay flat beside narrow bevels.
     """
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     weighted = np.cross(b - a, c - a)
@@ -37,7 +39,7 @@ def write_smooth_obj(path: Path, solid: Manifold, crease_angle_deg: float) -> in
     """Writes a solid given in mm, with smooth normals; returns its number of triangles."""
     vertices, faces = vertices_and_faces(solid)
     normals = corner_normals(vertices, faces, crease_angle_deg)
-    # Adding zero turns -0 into 0.
+    # Add zero, which turns -0 into 0.
     texts = [f"vn {x:.4f} {y:.4f} {z:.4f}" for x, y, z in np.round(normals.reshape(-1, 3), 4) + 0.0]
     index = {text: i + 1 for i, text in enumerate(dict.fromkeys(texts))}
     lines = [*_vertex_lines(vertices), *index]
@@ -51,13 +53,13 @@ def write_smooth_obj(path: Path, solid: Manifold, crease_angle_deg: float) -> in
 def flat_obj(
     vertices: np.ndarray, faces: np.ndarray, *, digits: int, normal_digits: int | None = None
 ) -> str:
-    """The OBJ text of a mesh, with one normal per face on request.
+    """Returns the OBJ text of a mesh, with one normal per face on request.
 
     Args:
         vertices: (n, 3), in metres.
         faces: (m, 3).
-        digits: decimals of the vertices.
-        normal_digits: decimals of the normals; None writes no normals.
+        digits: the number of decimals of the vertices.
+        normal_digits: the number of decimals of the normals; None writes no normals.
     """
     lines = [f"v {x:.{digits}f} {y:.{digits}f} {z:.{digits}f}" for x, y, z in vertices]
     if normal_digits is None:
@@ -73,12 +75,11 @@ def flat_obj(
 
 
 def write_convex_obj(path: Path, points: np.ndarray) -> None:
-    """Writes the convex hull of points (n, 3) in mm."""
-    # Import SciPy lazily.
+    """Writes the convex hull of points (n, 3) in mm as an OBJ file."""
     from scipy.spatial import ConvexHull
 
     hull = ConvexHull(points)
-    # Qhull does not orient its facets: flip those that wind against their outward normal.
+    # Qhull does not orient its facets: flip those whose winding contradicts their outward normal.
     a, b, c = (points[hull.simplices[:, k]] for k in range(3))
     inward = np.sum(np.cross(b - a, c - a) * hull.equations[:, :3], axis=1) < 0
     faces = np.where(inward[:, None], hull.simplices[:, ::-1], hull.simplices)

@@ -1,7 +1,7 @@
 """Scaled and weighted tools: section IV-B.2 of the paper scales a toolset's tools at random.
 
-A uniform scale s at constant density multiplies the mass by s^3, the moments of inertia by s^5 and
-all lengths by s.
+A uniform scale s at constant density multiplies all lengths by s, the mass by s^3 and the moments
+of inertia by s^5.
 """
 
 import dataclasses
@@ -20,21 +20,21 @@ from systems.grip_force import GRAVITY
 from systems.hand_geometry import MAX_OPENING
 
 _FORMAT_VERSION = "1"
-"""Part of the cache key. Change it when equal inputs give other files."""
+"""The version of the files in the cache. Increase it when equal inputs give different files."""
 _SAME_LENGTH = 1e-9
 _EASY_MOMENT = 0.2
-"""A moment about the axis of the pads that they hold easily, in N m."""
+"""The moment about the axis of the pads that they hold easily, in N m."""
 _WIDEST = MAX_OPENING - 0.015
-"""The greatest width of `other_grasps`, in metres."""
+"""The largest width of the tool's `other_grasps` after scaling, in metres."""
 
 _DRAKE = "http://drake.mit.edu"
 
 
 def scaled_tool(tool: Tool, length: float) -> Tool:
-    """The tool scaled uniformly to a length in metres; the same tool if it has that length.
+    """Scales a tool uniformly to a length in metres; returns it unchanged if it has that length.
 
     The scaled tool has its own SDFormat file in the cache, which scales the original's meshes. It
-    keeps the name and everything else of the original.
+    keeps the name and all other properties of the original.
 
     Raises:
         UserError: the length is not positive, the model cannot be scaled, or the cache cannot be
@@ -69,10 +69,11 @@ def scaled_tool(tool: Tool, length: float) -> Tool:
 
 
 def weighted_tool(tool: Tool, mass: float) -> Tool:
-    """The tool with another mass in kg, distributed as before; the same tool if it has that mass.
+    """Gives a tool another mass in kg; returns it unchanged if it has that mass.
 
-    The contact stiffness changes with the mass, so that the tool rests as before. Grasps by which a
-    heavy tool would turn between the pads come last.
+    The distribution of the mass stays the same. The contact stiffness changes with the mass, so
+    that the tool rests as before. Grasps by which the heavier tool would turn between the pads come
+    last.
 
     Raises:
         UserError: the mass is not positive, the model is not valid, or the cache cannot be written.
@@ -100,7 +101,8 @@ def weighted_tool(tool: Tool, mass: float) -> Tool:
 
 
 def _excess_moment(grasp: Grasp, root: ElementTree.Element, mass: float) -> float:
-    """The moment of the weight about the axis of the pads beyond what they hold easily, in N m."""
+    """Returns how much the weight's moment about the axis of the pads exceeds `_EASY_MOMENT`, in N
+    m."""
     pose = root.findtext(".//inertial/pose") or "0 0"
     x, y, *_ = map(float, pose.split())
     lever = (x - grasp.x) * math.cos(grasp.theta) + (y - grasp.y) * math.sin(grasp.theta)
@@ -108,7 +110,7 @@ def _excess_moment(grasp: Grasp, root: ElementTree.Element, mass: float) -> floa
 
 
 def _scaled_model(tool: Tool, factor: float) -> Path:
-    """The cache folder with the SDFormat file of a scaled tool."""
+    """Returns the folder in the cache that has the SDFormat file of a scaled tool."""
     original = tool.sdf.read_bytes()
     key = f"{_FORMAT_VERSION} {tool.sdf.resolve()} {factor!r}".encode()
     name = hashlib.sha256(key + original).hexdigest()[:24]
@@ -127,8 +129,9 @@ def scaled_sdf(text: str, directory: Path, factor: float) -> str:
     """Scales the SDFormat text of a model of meshes uniformly.
 
     Args:
-        text: the original.
-        directory: the base of the original's relative URIs; the result's are absolute.
+        text: the original text.
+        directory: the folder to which the original's relative URIs refer; the result has absolute
+            ones.
         factor: the scale.
 
     Raises:

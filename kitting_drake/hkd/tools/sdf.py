@@ -1,4 +1,4 @@
-"""The SDFormat text of a tool."""
+"""Writes the SDFormat text of a tool."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,9 +8,9 @@ import numpy as np
 from kitting_drake.hkd.tools.solids import MATERIALS
 
 # Contact parameters of every tool: Drake's hydroelastic modulus (Pa), dissipation (s/m), margin (m)
-# and friction. The margin is zero: with a margin, Drake 1.51 fails when it loads finely faceted
-# convex hulls, or when they touch a mesh. At this modulus and steps of 1/128 s, a flat bottom rests
-# quietly without one.
+# and friction. With a margin above zero, Drake 1.51 fails when it loads finely faceted convex
+# hulls, or when they touch a mesh. At this modulus and steps of 1/128 s, a flat bottom rests
+# quietly without a margin.
 HYDROELASTIC_MODULUS = 2e6
 HUNT_CROSSLEY_DISSIPATION = 20.0
 HYDROELASTIC_MARGIN = 0.0
@@ -56,16 +56,16 @@ def tool_sdf(
     collisions: Sequence[str],
     modulus: float = HYDROELASTIC_MODULUS,
 ) -> str:
-    """The SDFormat of a tool: one free link named `tool`, whose frame is the tool frame T.
+    """Returns the SDFormat text of a tool: one free link `tool`, whose frame is the tool frame T.
 
-    The OBJ files lie beside the SDFormat file, which names them relatively.
+    The SDFormat file refers to the OBJ files by relative paths; they must be in the same folder.
 
     Args:
         name: the name of the model.
-        mass: in kg.
-        center: (3,) the centre of mass in m.
+        mass: the mass in kg.
+        center: (3,) the centre of mass in T, in m.
         inertia: (3, 3) about the centre of mass, in kg m^2.
-        visuals: pairs of OBJ file and key of MATERIALS.
+        visuals: pairs of an OBJ file and a key of MATERIALS.
         collisions: OBJ files of convex hulls.
         modulus: Drake's hydroelastic modulus, in Pa.
     """

@@ -2,8 +2,8 @@
 
 Lengths are in mm, in the *design frame* of a tool: x along its length with the working end toward
 +x, and z up when the tool lies flat. Each shape is built twice from the same numbers: as an exact
-solid, for looks and mass, and as many small convex point sets that fill it. `collision.cover`
-merges the latter into few collision hulls.
+solid, for its looks and mass; and as many small convex point sets that fill it. `collision.cover`
+merges these point sets into few collision hulls.
 """
 
 import itertools
@@ -16,7 +16,8 @@ import numpy as np
 from manifold3d import CrossSection, JoinType, Manifold
 from numpy.typing import ArrayLike
 
-# Segments of a full circle, given at every call because manifold3d's default suits larger units.
+# The number of segments of a full circle. Pass it in every call, because manifold3d's default is
+# too coarse for lengths in mm.
 SEGMENTS = 48
 
 
@@ -35,7 +36,7 @@ MATERIALS: dict[str, Material] = {
     "dark_wood": Material(950.0, (0.45, 0.27, 0.14, 1.0)),
     "leather": Material(900.0, (0.55, 0.30, 0.14, 1.0)),
     "painted_wood": Material(750.0, (0.62, 0.13, 0.10, 1.0)),
-    # Painted aluminium.
+    # This material is painted aluminium.
     "red_enamel": Material(2700.0, (0.74, 0.07, 0.06, 1.0)),
     "red_grip": Material(1150.0, (0.80, 0.10, 0.09, 1.0)),
     "blue_grip": Material(1150.0, (0.07, 0.26, 0.62, 1.0)),
@@ -49,22 +50,22 @@ MATERIALS: dict[str, Material] = {
 
 @dataclass
 class Part:
-    """One homogeneous part of a tool, in mm in the design frame.
+    """One homogeneous part of a tool, in mm, in the design frame.
 
-    Where parts overlap, the volume belongs to the part earlier in the tool's list.
+    Where parts overlap, the volume belongs to the part that is earlier in the tool's list.
     """
 
     name: str
-    # A key of MATERIALS.
+    # The material, a key of MATERIALS.
     material: str
     solid: Manifold
-    # Point sets (n, 3) whose convex hulls fill the solid; empty for a part that lies inside the
-    # hulls of others.
+    # Point sets (n, 3) whose convex hulls fill the solid. The list is empty for a part that lies
+    # inside the hulls of other parts.
     hulls: list[np.ndarray] = field(default_factory=list)
 
 
 class Shape(NamedTuple):
-    """A solid and the convex point sets, each (n, 3), that fill it."""
+    """A solid, and convex point sets, each (n, 3), that fill it."""
 
     solid: Manifold
     hulls: list[np.ndarray]
@@ -75,13 +76,14 @@ class Shape(NamedTuple):
         return Shape(self.solid.rotate((180, 0, 0)), [h * flip for h in self.hulls])
 
 
-# --- Profiles: closed polygons in the plane, (n, 2), counter-clockwise. ---
+# Profiles: closed polygons (n, 2) in a plane, counter-clockwise.
 
 
 def circle(
     radius: float, center: Sequence[float] = (0.0, 0.0), segments: int = SEGMENTS
 ) -> np.ndarray:
-    """A regular polygon inscribed in a circle, with its first vertex toward +x."""
+    """Returns a regular polygon (segments, 2) inscribed in a circle, with its first vertex toward
+    +x."""
     angles = 2 * np.pi * np.arange(segments) / segments
     return np.asarray(center) + radius * np.column_stack([np.cos(angles), np.sin(angles)])
 
@@ -91,7 +93,7 @@ def fillet(
 ) -> np.ndarray:
     """Replaces each corner of a closed polygon by an arc.
 
-    A radius too large for its edges is reduced; zero keeps the corner.
+    If a radius is too large for the edges at its corner, it is reduced; zero keeps the corner.
     """
     corners = np.asarray(points, dtype=float)
     corner_radii = np.broadcast_to(np.asarray(radii, dtype=float), len(corners))
@@ -107,7 +109,7 @@ def fillet(
         length_u, length_v = np.linalg.norm(u), np.linalg.norm(v)
         u, v = u / length_u, v / length_v
         half = 0.5 * np.arccos(np.clip(u @ v, -1.0, 1.0))
-        # Leave a little of each edge, so that neighbouring arcs share no point.
+        # Leave a short piece of each edge, so that neighbouring arcs share no point.
         setback = min(radius / np.tan(half), 0.49 * length_u, 0.49 * length_v)
         if setback < 1e-6 or half > 0.5 * np.pi - 1e-3:
             result.append(corner)
@@ -126,14 +128,14 @@ def fillet(
 
 
 def rounded_rectangle(width: float, height: float, radius: float, segments: int = 4) -> np.ndarray:
-    """A rectangle about the origin with arcs as corners: 4 (segments + 1) vertices."""
+    """Returns a rectangle about the origin with arcs as corners: 4 (segments + 1) vertices."""
     x, y = width / 2, height / 2
     radius = min(radius, 0.98 * min(x, y))
     return fillet([(-x, -y), (x, -y), (x, y), (-x, y)], radius, segments)
 
 
 def ribbon(path: np.ndarray, widths: np.ndarray) -> np.ndarray:
-    """The outline (2n, 2) of a band of `widths` (n) along a `path` (n, 2)."""
+    """Returns the outline (2n, 2) of a band around a path (n, 2) with given widths (n)."""
     tangent = np.gradient(path, axis=0)
     normal = np.column_stack([-tangent[:, 1], tangent[:, 0]])
     normal *= 0.5 * np.asarray(widths)[:, None] / np.linalg.norm(normal, axis=1, keepdims=True)
@@ -149,16 +151,16 @@ def blend(profile: CrossSection, inner_radius: float, outer_radius: float = 0.0)
 
 
 def without_holes(profile: CrossSection) -> CrossSection:
-    """The profile with its holes filled."""
+    """Fills the holes of a profile."""
     outer = [p for p in profile.to_polygons() if CrossSection([p]).area() > 0]
     return CrossSection(outer) if outer else profile
 
 
-# --- Solids. ---
+# Solids.
 
 
 def _stitched(rings: np.ndarray, caps: tuple[np.ndarray, np.ndarray]) -> Manifold:
-    """The solid of equal loops `rings` (m, n, 3), joined by quads and closed by end caps."""
+    """Joins equal loops `rings` (m, n, 3) by quads, and closes the ends by caps."""
     count, size = rings.shape[:2]
     i = np.arange(size)
     j = (i + 1) % size
@@ -176,7 +178,7 @@ def _stitched(rings: np.ndarray, caps: tuple[np.ndarray, np.ndarray]) -> Manifol
 
 
 def _closed_solid(vertices: np.ndarray, faces: np.ndarray) -> Manifold:
-    """The solid of a closed mesh, with all faces flipped if they point inward."""
+    """Makes the solid of a closed mesh; flips all faces if they point inward."""
     solid = Manifold(manifold3d.Mesh64(np.ascontiguousarray(vertices), faces.astype(np.uint64)))
     if solid.status() != manifold3d.Error.NoError:
         raise ValueError(f"the mesh is not manifold: {solid.status()}")
@@ -190,10 +192,10 @@ def plate(
     bevel: float = 0.8,
     cells: Sequence[CrossSection] = (),
 ) -> Shape:
-    """A plate between two heights with its outer edges bevelled at 45 degrees.
+    """Makes a plate between two heights, with its outer edges bevelled at 45 degrees.
 
-    Holes have plain edges and do not appear in the hulls. There is one hull for the part of the
-    profile in each of `cells`, or without cells for each triangle of a triangulation.
+    Holes have plain edges, and the hulls ignore them. There is one hull for the part of the profile
+    in each of `cells`. Without cells, there is one for each triangle of a triangulation.
     """
     if isinstance(profile, np.ndarray):
         profile = CrossSection([profile])
@@ -206,16 +208,16 @@ def plate(
 
 
 def _bevelled(profile: CrossSection, z_low: float, z_high: float, bevel: float) -> Manifold:
-    """The plate's solid.
+    """Makes the solid of a bevelled plate.
 
-    The inset outline may have other vertices or loops than the outline. So a bevel is made by
-    triangulating the strip between the two in the plane and lifting it.
+    The outline after the inset may have other vertices or loops than the outline before it. So the
+    strip between the two is triangulated in the plane and then lifted.
     """
     outer = profile.to_polygons()
     inner = profile.offset(-bevel, JoinType.Miter).to_polygons()
     rim, top = np.vstack(outer), np.vstack(inner)
     strip = manifold3d.triangulate([*outer, *(loop[::-1] for loop in inner)])
-    # The strip lists the inner loops backward: number their vertices as in the cap.
+    # The strip lists the inner loops backward, so number their vertices as in the cap.
     numbers = np.arange(len(top))
     starts = np.cumsum([len(loop) for loop in inner])[:-1]
     backward = np.concatenate([n[::-1] for n in np.split(numbers, starts)])
@@ -247,11 +249,11 @@ def _plate_hulls(
     bevel: float,
     cells: Sequence[CrossSection],
 ) -> list[np.ndarray]:
-    """Prisms over the cells or triangles of the profile; only the profile's rim is bevelled."""
+    """Makes prisms over the cells or triangles of a profile; only the profile's rim is bevelled."""
     coarse = profile.simplify(0.08)
     loops = coarse.to_polygons()
     points = np.vstack(loops)
-    # The upper bevel is left out: nothing slides over it, and each vertex costs contact time.
+    # Leave out the upper bevel: nothing slides over it, and each vertex costs contact time.
     levels = [(z_low, bevel), (z_low + bevel, 0.0), (z_high, 0.0)]
     insets = {
         inset: coarse.offset(-inset, JoinType.Miter, circular_segments=SEGMENTS)
@@ -270,14 +272,14 @@ def _plate_hulls(
 
 
 def loft(sections: Sequence[np.ndarray]) -> Shape:
-    """A skin through cross-sections (n, 3) of equal n, each star-shaped about its mean."""
+    """Makes a skin through cross-sections (n, 3) of equal n, each star-shaped about its mean."""
     rings = np.asarray(sections, dtype=float)
     caps = tuple(manifold3d.triangulate([_planar(ring)]) for ring in (rings[0], rings[-1]))
     return Shape(_stitched(rings, caps), [np.vstack(pair) for pair in itertools.pairwise(rings)])
 
 
 def _planar(ring: np.ndarray) -> np.ndarray:
-    """A flat ring (n, 3) in coordinates of its own plane (n, 2), counter-clockwise."""
+    """Converts a flat ring (n, 3) to coordinates (n, 2) in its own plane, counter-clockwise."""
     centered = ring - ring.mean(axis=0)
     u = centered[0] / np.linalg.norm(centered[0])
     normal = np.sum(np.cross(centered, np.roll(centered, -1, axis=0)), axis=0)
@@ -286,12 +288,12 @@ def _planar(ring: np.ndarray) -> np.ndarray:
 
 
 def across_x(profile: np.ndarray, x: float, y: float = 0.0, z: float = 0.0) -> np.ndarray:
-    """A section (n, 3) of a loft along x, with the profile's axes along y and z."""
+    """Returns a section (n, 3) of a loft along x, with the profile's axes along y and z."""
     return np.column_stack([np.full(len(profile), x), profile[:, 0] + y, profile[:, 1] + z])
 
 
 def across_path(profile: np.ndarray, point: ArrayLike, angle: float) -> np.ndarray:
-    """A section (n, 3) of a loft in the xy plane at `point`, at `angle` (rad) from +x."""
+    """Returns a section (n, 3) of a loft in the xy plane at `point`, at `angle` (rad) from +x."""
     left = np.array([-np.sin(angle), np.cos(angle)])
     xy = np.asarray(point) + profile[:, :1] * left
     return np.column_stack([xy, profile[:, 1]])

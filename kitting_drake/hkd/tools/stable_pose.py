@@ -14,26 +14,27 @@ from scipy.spatial import ConvexHull, QhullError
 
 Array = NDArray[np.float64]
 
-# Triangles of the hull whose normals differ by less belong to one facet.
+# The largest angle between the normals of triangles of the hull that belong to one facet.
 _COPLANAR = 1e-3
 
 
 @dataclass(frozen=True)
 class StablePose:
-    """A stable pose of a body, in the body's frame B and in the unit of its points."""
+    """A stable pose of a body, in the body's frame B, in the unit of the body's points."""
 
     normal: Array
-    """(3,) the outward normal of the supporting facet, which points down at rest."""
+    """The outward normal (3,) of the supporting facet, in B; it points down at rest."""
     height: float
     """The height of the centre of mass above the table."""
     margin: float
-    """The distance of the centre of mass from the support's edge, seen from above."""
+    """The horizontal distance of the centre of mass from the edge of the supporting facet."""
 
     def rotation(self, forward: Array) -> Array:
-        """R_TB (3, 3): turns the normal to -z and `forward` into the xz plane, toward +x.
+        """Returns R_TB (3, 3), which turns the normal to -z and `forward` into the xz plane, toward
+        +x.
 
         Args:
-            forward: (3,) a direction in B, not parallel to the normal.
+            forward: (3,) a direction in B that is not parallel to the normal.
         """
         z = -self.normal
         x = forward - (forward @ z) * z
@@ -42,10 +43,10 @@ class StablePose:
 
 
 def stable_poses(points: Array, center_of_mass: Array) -> list[StablePose]:
-    """The stable poses of a body, in a deterministic order.
+    """Returns the stable poses of a body, in a deterministic order.
 
     Args:
-        points: (n, 3) in the body's frame B; their convex hull is the body's.
+        points: (n, 3) in the body's frame B; the body's convex hull is theirs.
         center_of_mass: (3,) in B.
 
     Raises:
@@ -63,7 +64,7 @@ def stable_poses(points: Array, center_of_mass: Array) -> list[StablePose]:
         margin = _support_margin(support, normals[members[0]], center_of_mass)
         if margin <= 0:
             continue
-        # Of nearly coplanar triangles, take the normal of the one below the centre of mass.
+        # Of nearly coplanar triangles, use the normal of the triangle below the centre of mass.
         shares = [_least_share(hull, points, int(member), center_of_mass) for member in members]
         bearing = members[int(np.argmax(shares))]
         normal = normals[bearing]
@@ -86,7 +87,8 @@ def _support_margin(support: Array, normal: Array, center_of_mass: Array) -> flo
 
 
 def _least_share(hull: ConvexHull, points: Array, triangle: int, center_of_mass: Array) -> float:
-    """The least barycentric coordinate of the centre of mass over a triangle of the hull."""
+    """Returns the smallest barycentric coordinate of the centre of mass over a triangle of the
+    hull."""
     *normal, offset = hull.equations[triangle]
     foot = center_of_mass - (center_of_mass @ np.array(normal) + offset) * np.array(normal)
     corners = points[hull.simplices[triangle]]

@@ -1,7 +1,7 @@
 """Rotational symmetry of tools about z.
 
-A tool is symmetric if its rotated copy has nearly the same surface and nearly the same outline, and
-so fits the same cavity. The rotated tool in its cavity then counts as the same placement.
+A tool is symmetric if its rotated copy has nearly the same surface and nearly the same outline. The
+rotated tool then fits the same cavity, and counts as placed in the same way.
 """
 
 from collections.abc import Callable
@@ -18,44 +18,48 @@ from kitting_drake.hkd.tools.collision import furthest
 from kitting_drake.hkd.tools.tool import footprint
 
 MOST_SURFACE_DISTANCE_MM = 0.5
-"""The upper limit of the mean distance between a symmetric tool and its rotated copy."""
+"""The largest mean distance between a symmetric tool and its rotated copy, in mm."""
 
 MOST_OUTLINE_DEVIATION_MM = 2.0
-"""The upper limit of the largest distance between their outlines: a cavity's clearance."""
+"""The largest distance between the outlines of a symmetric tool and its rotated copy, in mm. It is
+the clearance of a cavity."""
 
 ORDERS = (24, 12, 10, 9, 8, 7, 6, 5, 4, 3, 2)
-"""The orders to try, largest first; the first stands for round tools."""
+"""The orders to try, largest first. The largest stands for round tools."""
 
 _SAMPLES, _DENSE_SAMPLES = 4000, 400_000
 
 _FAR_MM, _COARSER = 2.0, 20
-"""Distances beyond the first are measured to every so many samples.
+"""First a distance in mm, then a stride: distances above the first are measured to a subset of the
+samples only, one in every `_COARSER`.
 
-A point on the axis of a hollow part is equally far from all of the wall, so that its nearest
-neighbour takes long to find.
+This saves time, because the search for the nearest neighbour is slow for a point on the axis of a
+hollow part: it is equally far from the whole wall.
 """
 
 _REACH_MM = 0.75
-"""The shift that best fits the surfaces is within this of the one that best fits the outlines."""
+"""The largest distance in mm between the shift that best fits the surfaces and the one that best
+fits the outlines."""
 
 Shift = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Difference:
-    """The difference between a tool and its rotated copy, each at the best translation."""
+    """The difference between a tool and its rotated copy, each measure at the translation that
+    makes it least."""
 
     outline_deviation_mm: float
-    """The largest distance of a point of one outline from the other, capped at 5 mm."""
+    """The largest distance of a point of one outline from the other outline, at most 5 mm."""
     surface_distance_mm: float
-    """The symmetric mean distance of the surfaces; infinite if the outlines differ too much.
+    """The symmetric mean distance of the surfaces, or infinity if the outlines differ too much.
 
     Unless the comparison is complete, a value above the limit is only a lower bound.
     """
 
     @property
     def is_symmetric(self) -> bool:
-        """Whether the copy looks and fits like the tool."""
+        """Whether the rotated copy looks like the tool and fits its cavity."""
         return (
             self.outline_deviation_mm < MOST_OUTLINE_DEVIATION_MM
             and self.surface_distance_mm < MOST_SURFACE_DISTANCE_MM
@@ -63,7 +67,8 @@ class Difference:
 
 
 def symmetry_order(triangles: NDArray[np.float64]) -> int:
-    """The order of a tool's rotational symmetry about z: the largest of `ORDERS`, or 1 for none.
+    """Returns the order of a tool's rotational symmetry about z: the largest of `ORDERS` that
+    holds, or 1.
 
     Args:
         triangles: (n, 3, 3) the surface in frame T, in metres.
@@ -71,7 +76,7 @@ def symmetry_order(triangles: NDArray[np.float64]) -> int:
     outline = footprint(triangles).scale((1e3, 1e3))
     size = _size(outline)
     for order in ORDERS:
-        # At any translation, the deviation is at least half of the difference in size.
+        # At any translation, the deviation is at least half the difference in size.
         differs = np.abs(_size(outline.rotate(360.0 / order)) - size).max()
         alike = differs < 2 * MOST_OUTLINE_DEVIATION_MM
         if alike and measure_rotation(triangles, order).is_symmetric:
@@ -80,7 +85,7 @@ def symmetry_order(triangles: NDArray[np.float64]) -> int:
 
 
 def _size(outline: CrossSection) -> NDArray[np.float64]:
-    """(2,) the extents along x and y."""
+    """Returns the extents (2,) of an outline along x and y."""
     bounds = np.array(outline.bounds())
     return bounds[2:] - bounds[:2]
 
@@ -88,15 +93,16 @@ def _size(outline: CrossSection) -> NDArray[np.float64]:
 def measure_rotation(
     triangles: NDArray[np.float64], order: int = 2, *, complete: bool = False
 ) -> Difference:
-    """Compares a tool with its copy, rotated by 2 pi / order.
+    """Compares a tool with its copy, rotated about z by 2 pi / order.
 
-    The copy is first translated to minimize the area that only one of the outlines covers. From
-    there, two separate searches minimize the outlines' deviation and the surfaces' distance.
+    The copy is first translated so that the area that only one of the outlines covers is least.
+    From there, two separate searches minimize the deviation of the outlines and the distance of the
+    surfaces.
 
     Args:
         triangles: (n, 3, 3) the surface in frame T, in metres.
         order: the order of the symmetry; 2 is a half turn.
-        complete: compare the surfaces even if the outlines differ too much.
+        complete: whether to compare the surfaces even if the outlines differ too much.
     """
     outline = footprint(triangles).scale((1e3, 1e3))
     copy = outline.rotate(360.0 / order)
@@ -111,7 +117,7 @@ def measure_rotation(
 
     shift, _ = _minimum(uncommon_area, np.zeros(2), 2.0)
     outline_deviation = deviation(shift)
-    # A deviation of twice the limit is too large for another translation to make up.
+    # If the deviation is twice the limit, no other translation can bring it below the limit.
     if complete or outline_deviation < 2 * MOST_OUTLINE_DEVIATION_MM:
         outline_deviation = _minimum(deviation, shift, 0.5)[1]
     if not complete and outline_deviation >= MOST_OUTLINE_DEVIATION_MM:
@@ -123,7 +129,8 @@ def measure_rotation(
 def _surface_distance(
     triangles: NDArray[np.float64], order: int, start: Shift, *, complete: bool
 ) -> float:
-    """The mean distance of a surface and its rotated copy, minimized from the shift `start`.
+    """Returns the mean distance of a surface and its rotated copy, minimized from the shift
+    `start`.
 
     Unless `complete`, a value of at least `MOST_SURFACE_DISTANCE_MM` may be too low.
     """
@@ -145,8 +152,8 @@ def _surface_distance(
             distances[far], _ = coarse_tree.query(places[far])
         return float(distances.mean())
 
-    # The mean of two directions: from the copy to the original, and from the original to the copy.
-    # For a half turn they are equal.
+    # Average two directions: from the copy to the original, and from the original to the copy. For
+    # a half turn they are equal.
     def mean_distance(shift: Shift) -> float:
         offset = np.append(shift, 0.0)
         there = mean_to_surface(points @ R.T + offset)
@@ -154,7 +161,7 @@ def _surface_distance(
         return float(there + back) / 2
 
     if not complete:
-        # A shift changes the distance by at most its own length.
+        # A shift changes the distance by at most the length of the shift.
         least = mean_distance(start) - _REACH_MM
         if least >= MOST_SURFACE_DISTANCE_MM:
             return least
@@ -162,7 +169,7 @@ def _surface_distance(
 
 
 def _minimum(function: Callable[[Shift], float], start: Shift, step: float) -> tuple[Shift, float]:
-    """The shift near `start` that minimizes a function, and the minimum."""
+    """Minimizes a function near the shift `start`; returns the best shift and the minimum."""
     found = minimize(
         function,
         start,

@@ -1,4 +1,4 @@
-"""Tools: folders with an SDFormat model, its meshes and a record."""
+"""Tools: folders with an SDFormat model, its meshes and a record (`tool.yaml`)."""
 
 import dataclasses
 import difflib
@@ -23,9 +23,9 @@ CATEGORIES = ("hammer", "pliers", "wrench", "screwdriver")
 """The four categories of the paper (section IV-B.1). User tools may have others."""
 
 SHORTEST_MM, LONGEST_MM = 15.0, 350.0
-"""The range of lengths of a user's tool."""
+"""The shortest and the longest length of a user's tool, in mm."""
 
-# libyaml reads records ten times as fast.
+# libyaml reads records ten times as fast as PyYAML's own loader.
 RecordLoader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
@@ -33,19 +33,19 @@ RecordLoader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 class Tool:
     """One hand tool.
 
-    The tool frame T: z up in the tool's stable pose with the table at z = 0, x along the tool's
-    length with the working end at +x, the origin centred in the footprint's bounding box.
+    The tool frame T has z up in the tool's stable pose, with the table at z = 0. Its x is along the
+    tool's length with the working end at +x. Its origin is centred in the footprint's bounding box.
     """
 
     directory: Path
     name: str
     category: str
-    """One of `CATEGORIES`, or another name of small letters, digits and underscores."""
+    """One of `CATEGORIES`, or another name of lower-case letters, digits and underscores."""
     split: str
-    """`train` or `test` (section IV-B.1 of the paper), `fresh` (reserved for a final test), or
-    `user` for a user's own tool."""
+    """The split: `train` or `test` (section IV-B.1 of the paper), `fresh` (reserved for a final
+    test), or `user` for a user's own tool."""
     length: float
-    """Extents of the bounding box along x, y and z of T, in metres."""
+    """The extents of the bounding box along x, y and z of T, in metres."""
     width: float
     height: float
     mass: float
@@ -53,12 +53,12 @@ class Tool:
     grasp: Grasp
     visual_meshes: tuple[Path, ...]
     symmetry: int = 1
-    """The order of the rotational symmetry about T's z: 1 for none, 2 for a reversible tool whose
-    half turn in its cavity is the same placement."""
+    """The order of the rotational symmetry about T's z. 1 means none. 2 means that the tool may
+    also lie in its cavity turned by a half turn."""
     scale: float = 1.0
-    """The factor by which the visual meshes' files are scaled."""
+    """The factor by which the meshes in the visual files are scaled."""
     other_grasps: tuple[Grasp, ...] = ()
-    """More grasps, best first, for when the first one fails."""
+    """More grasps, best first, to try after the annotated grasp has failed."""
 
     @property
     def grasps(self) -> tuple[Grasp, ...]:
@@ -67,7 +67,7 @@ class Tool:
 
     @property
     def sdf(self) -> Path:
-        """The model, with one free link `tool` whose body frame is T."""
+        """The SDFormat model, with one free link `tool` whose body frame is T."""
         return self.directory / f"{self.name}.sdf"
 
     @cached_property
@@ -82,7 +82,7 @@ class Tool:
 
     @cached_property
     def triangles(self) -> NDArray[np.float64]:
-        """(n, 3, 3) the triangles of the visual surface, in T, in metres.
+        """The triangles (n, 3, 3) of the visual surface, in T, in metres.
 
         Raises:
             UserError: a file is not a mesh.
@@ -98,17 +98,18 @@ class Tool:
 
     @property
     def axis(self) -> tuple[float, float] | None:
-        """(x, y) of the axis of symmetry in T, in metres; None: the middle of the bounding box.
+        """The point (x, y) on the axis of symmetry in T, in metres; None: the middle of the
+        bounding box.
 
-        It is the footprint's centroid if the order is odd.
+        If the order is odd, it is the footprint's centroid.
         """
         if self.symmetry < 3 or self.symmetry % 2 == 0:
             return None
         return centroid(self.footprint)
 
     def surface_points(self, count: int, seed: int = 0) -> NDArray[np.float64]:
-        """(count, 3) points spread over the surface by area, in T, in metres; deterministic."""
-        # Import trimesh lazily.
+        """Returns points (count, 3) spread over the surface by area, in T, in metres;
+        deterministic."""
         import trimesh
 
         faces = np.arange(3 * len(self.triangles)).reshape(-1, 3)
@@ -118,7 +119,6 @@ class Tool:
 
 
 def _read_triangles(path: Path) -> NDArray[np.float64]:
-    # Import trimesh lazily.
     import trimesh
 
     try:
@@ -132,7 +132,7 @@ def _read_triangles(path: Path) -> NDArray[np.float64]:
 
 
 def footprint(triangles: NDArray[np.float64]) -> CrossSection:
-    """The union of triangles (n, 3, 3) projected along z; the mesh may be open."""
+    """Returns the union of triangles (n, 3, 3) projected along z; the mesh may be open."""
     flat = np.array(triangles[:, :, :2], dtype=float)
     edge_1, edge_2 = flat[:, 1] - flat[:, 0], flat[:, 2] - flat[:, 0]
     area = edge_1[:, 0] * edge_2[:, 1] - edge_1[:, 1] * edge_2[:, 0]
@@ -141,7 +141,7 @@ def footprint(triangles: NDArray[np.float64]) -> CrossSection:
 
 
 def centroid(outline: CrossSection) -> tuple[float, float]:
-    """The centroid of the area that an outline encloses."""
+    """Returns the centroid of the area that an outline encloses."""
     area, moment = 0.0, np.zeros(2)
     for loop in outline.to_polygons():
         start = np.asarray(loop, dtype=float)
@@ -154,12 +154,12 @@ def centroid(outline: CrossSection) -> tuple[float, float]:
 
 
 def load_tool(name: str, base: Path | None = None) -> Tool:
-    """Loads a tool by its name under `models/tools` or `user_tools`, or by its folder's path.
+    """Loads a tool by its name in `models/tools` or `user_tools`, or by its folder's path.
 
     Args:
-        name: a name, or a path, absolute or relative to `base`. The project's own tool of a name
-            has precedence over the user's, and both over a path.
-        base: the base of relative paths; the working directory if None.
+        name: a name, or a path that is absolute or relative to `base`. If several tools match, the
+            project's own tool is chosen before the user's tool, and a path last.
+        base: the folder to which relative paths refer; the working directory if None.
 
     Raises:
         UserError: the tool does not exist, or its record or a mesh is missing or broken.
@@ -175,7 +175,9 @@ def load_tool(name: str, base: Path | None = None) -> Tool:
     if not record_path.is_file():
         close = difflib.get_close_matches(name, [*tool_names(), *user_tool_names()], n=1)
         advice = f"did you mean '{close[0]}'?" if close else "`hkd list` lists all tools"
-        raise UserError(f"there is no tool '{name}', nor a folder with a tool.yaml: {advice}")
+        raise UserError(
+            f"there is no tool '{name}', and no folder of that name with a tool.yaml: {advice}"
+        )
     try:
         record = yaml.load(record_path.read_text(), Loader=RecordLoader)
         tool = Tool(
@@ -225,20 +227,24 @@ def _read_grasp(record: Mapping[str, float]) -> Grasp:
 
 @lru_cache(maxsize=32)
 def _shared(tool: Tool, changed: tuple[int, ...]) -> Tool:
-    """One shared instance of equal tools, so that their meshes are read once.
+    """Returns one shared instance for equal tools, so that their meshes are read once.
 
     Args:
         tool: a tool.
-        changed: the modification times of its meshes.
+        changed: the modification times of its meshes, which are part of the key.
     """
     return tool
 
 
 def check_category(category: str) -> None:
-    """Raises UserError if a name is not valid for a category."""
+    """Checks that a name is valid for a category.
+
+    Raises:
+        UserError: it is not.
+    """
     if not re.fullmatch(r"[a-z][a-z0-9_]{0,31}", category):
         raise UserError(
-            f"category '{category}' must be a name of small letters, digits and underscores, "
+            f"category '{category}' must consist of lower-case letters, digits and underscores, "
             f"such as {', '.join(CATEGORIES)}"
         )
 
@@ -249,7 +255,8 @@ def tool_names() -> list[str]:
 
 
 def user_tools() -> Path:
-    """The folder of the user's tools: `$KITTING_DRAKE_TOOLS`, or one in `~/.local/share`."""
+    """The folder of the user's tools: `$KITTING_DRAKE_TOOLS`, or else a folder in
+    `~/.local/share`."""
     given = os.environ.get("KITTING_DRAKE_TOOLS")
     return (
         Path(given).absolute()
@@ -260,6 +267,6 @@ def user_tools() -> Path:
 
 def user_tool_names() -> list[str]:
     """The names of the tools in `user_tools`."""
-    # Folders whose names begin with a dot are unfinished.
+    # Skip folders whose names begin with a dot, because they are unfinished.
     records = user_tools().glob("[!.]*/tool.yaml")
     return sorted(path.parent.name for path in records)

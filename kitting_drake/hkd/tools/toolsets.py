@@ -8,16 +8,17 @@ from kitting_drake.hkd.tools.tool import CATEGORIES, load_tool, tool_names
 PAPER_SPLITS = ("train", "test")
 """The splits of the paper's dataset (section IV-B.1): forty tools to train, twenty to test."""
 SPLITS = (*PAPER_SPLITS, "fresh")
-"""All splits. The seeds depend on their order, so append new ones. The ten `fresh` tools are not
-the paper's: they are reserved for a final test, and nothing is trained or tuned with them."""
+"""All splits. Append new ones, because the seeds depend on the order. The ten `fresh` tools are not
+in the paper's data set: they are reserved for a final test, and nothing is trained or tuned with
+them."""
 TOOLSET_COUNT = 100
-"""The number of toolsets of a split, unless it has fewer combinations."""
+"""The number of toolsets of a split, unless the split has fewer combinations."""
 TOOLSETS_SEED = 2024
 """The seed of the random draw."""
 
 
 def tool_pools(split: str) -> dict[str, list[str]]:
-    """The names of a split's tools by category, in the order of `CATEGORIES`."""
+    """Returns the names of a split's tools by category, in the order of `CATEGORIES`."""
     pools: dict[str, list[str]] = {category: [] for category in CATEGORIES}
     for name in tool_names():
         tool = load_tool(name)
@@ -27,9 +28,10 @@ def tool_pools(split: str) -> dict[str, list[str]]:
 
 
 def toolsets(split: str) -> list[tuple[str, ...]]:
-    """The split's toolsets: distinct and deterministic, each in the order of `CATEGORIES`.
+    """Returns a split's toolsets, each in the order of `CATEGORIES`. They are distinct and
+    deterministic.
 
-    There are `TOOLSET_COUNT`, or all combinations if there are fewer.
+    There are `TOOLSET_COUNT` toolsets, or all combinations if these are fewer.
 
     Raises:
         UserError: a category has no tool in the split.
