@@ -1,10 +1,10 @@
-"""From a real camera's frames to one pick and place in the robot's frame. Does not import pydrake.
+"""Turns a real camera's frames into one pick and place in the robot's frame, without pydrake.
 
 from pathlib import Path
 from kitting_drake.real_camera import Frame, decide, load_policy, read_calibration
 
 calibration = read_calibration(Path("calibration.yaml"))
-policy = load_policy()                      # once; loads the generalist
+policy = load_policy()                      # loads the generalist; call it once
 failed = []
 while True:
     color, depth = my_camera()              # (480, 640, 3) bytes, (480, 640) metres

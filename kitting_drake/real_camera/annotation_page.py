@@ -1,13 +1,13 @@
-"""A local page on which a person clicks pick, place and jaw direction on o_t.
+"""A local web page on which a person clicks pick, place and jaw direction on the observation o_t.
 
-The server listens on 127.0.0.1 only, and speaks JSON and PNG:
+The server listens on 127.0.0.1 only. It answers these requests in HTML, JSON or PNG:
 
-- `GET /` is the page, one file of HTML and JavaScript,
-- `GET /steps` is the grid, the jaws, and each step's name and action,
-- `GET /steps/N/color.png` and `height.png` are o_t, one image pixel per grid pixel,
-- `POST /steps/N` with the content of an `action.json` writes it beside the frames.
+- `GET /`: the page, one file of HTML and JavaScript.
+- `GET /steps`: the grid, the jaws, and the name and action of each step.
+- `GET /steps/N/color.png` and `height.png`: o_t, with one image pixel per grid pixel.
+- `POST /steps/N` with the content of an `action.json`: writes it to the folder of the frames.
 
-Errors are `{"error": ...}` with one sentence and the status 400, 403 or 404.
+An error is answered with `{"error": ...}`, a sentence, and the status 400, 403 or 404.
 """
 
 from __future__ import annotations
@@ -43,22 +43,23 @@ from systems.signals import Observation
 _PAGE = Path(__file__).with_name("annotation_page.html")
 _HOST = "127.0.0.1"
 _LONGEST = 100_000
-"""The largest size of an action, in bytes."""
+"""The largest size of an action in JSON, in bytes."""
 _LEAST_RANGE = 0.02
-"""White stands for at least this height, in metres, so that noise on an empty table stays dark."""
+"""The least height for which white stands, in metres. It keeps noise on an empty table dark."""
 _UNSEEN = np.array([60, 0, 90], np.uint8)
-"""The colour of pixels that no camera sees."""
+"""The colour (RGB) of pixels that no camera sees."""
 
 
 class AnnotationServer(ThreadingHTTPServer):
-    """Serves the page with `serve_forever`, until it is shut down."""
+    """A server of the page; `serve_forever` runs it until it is shut down."""
 
     def __init__(self, steps: Sequence[StepFolder], calibration: Calibration, port: int = 0):
-        """
+        """Opens the port.
+
         Args:
             steps: the steps to annotate, at least one.
             calibration: the cameras' calibration.
-            port: the port on 127.0.0.1; 0 for any free one.
+            port: the port on 127.0.0.1; 0 for any free port.
 
         Raises:
             UserError: the first step's frames are unusable, or the port is taken.
@@ -67,7 +68,7 @@ class AnnotationServer(ThreadingHTTPServer):
         self.calibration = calibration
         self._lock = threading.Lock()
         self._read = lru_cache(maxsize=8)(lambda path: read_observation(path, calibration))
-        # Fail early: otherwise only the page would report a wrong calibration.
+        # Read one observation now, so that a wrong calibration is reported before the page opens.
         self.observation(0)
         try:
             super().__init__((_HOST, port), _Handler)
@@ -80,21 +81,21 @@ class AnnotationServer(ThreadingHTTPServer):
         return f"http://{_HOST}:{self.server_address[1]}/"
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Reports errors, except for connections that the browser closed."""
+        """Reports errors, except those of connections that the browser closed."""
         if not isinstance(sys.exception(), ConnectionError):
             super().handle_error(request, client_address)
 
     def observation(self, index: int) -> Observation:
-        """o_t of a step.
+        """Returns the observation o_t of a step.
 
         Raises:
-            UserError: its frames are unusable.
+            UserError: the step's frames are unusable.
         """
         with self._lock:
             return self._read(self.steps[index].path)
 
     def describe(self) -> dict[str, Any]:
-        """The grid and the steps as JSON for the page, in metres and radians."""
+        """Returns the grid and the steps as JSON for the page, in metres and radians."""
         grid = self.calibration.grid
         return {
             "grid": {
@@ -119,7 +120,7 @@ class AnnotationServer(ThreadingHTTPServer):
         """Writes the action of a step.
 
         Raises:
-            UserError: the action is invalid or cannot be written; the old file then stays.
+            UserError: the action is invalid or cannot be written. An existing file is then kept.
         """
         step = self.steps[index]
         action = dataclasses.replace(
@@ -156,7 +157,7 @@ class _Handler(BaseHTTPRequestHandler):
     def do_POST(self) -> None:
         """Saves an action."""
         step = re.fullmatch(r"/steps/(\d+)", self.path)
-        # Browsers do not let pages of other origins send JSON without permission.
+        # Require JSON, because browsers let pages of other origins send it only with permission.
         if not self._is_local() or self.headers.get_content_type() != "application/json":
             self._fail(HTTPStatus.FORBIDDEN, "an action must be JSON sent by the page itself")
             return
@@ -171,10 +172,11 @@ class _Handler(BaseHTTPRequestHandler):
         self._send_json(self.server.describe())
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Logs nothing: the page itself reports what happens."""
+        """Does nothing, because the page itself reports what happens."""
 
     def _is_local(self) -> bool:
-        """Whether the request names this machine, rather than a foreign name that points to it."""
+        """Whether the request's Host header names this machine; a foreign name may also point to
+        it."""
         name = self.headers.get("Host", "").split(":")[0]
         return name in (_HOST, "localhost")
 
@@ -191,7 +193,7 @@ class _Handler(BaseHTTPRequestHandler):
         self._send("application/json", json.dumps(value).encode(), status)
 
     def _fail(self, status: HTTPStatus, reason: str) -> None:
-        # The request may be unread, so the connection cannot be reused.
+        # The request may not have been read, so the connection cannot be reused.
         self.close_connection = True
         self._send_json({"error": reason}, status)
 
@@ -205,13 +207,13 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 def draw_color(observation: Observation) -> bytes:
-    """The colours of o_t: a PNG of (rows, cols), row 0 on top."""
+    """Draws the colours of o_t as a PNG of (rows, cols), with row 0 at the top."""
     rgb = np.rint(255 * observation.rgb.transpose(1, 2, 0)).astype(np.uint8)
     return _png(rgb, observation)
 
 
 def draw_height(observation: Observation) -> bytes:
-    """The heights of o_t, from black at the table to white: a PNG as in `draw_color`."""
+    """Draws the heights of o_t as a PNG of (rows, cols), from black at the table to white."""
     height = observation.height
     top = max(float(np.percentile(height, 99.5)), _LEAST_RANGE)
     grey = np.rint(255 * np.clip(height / top, 0, 1)).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""The policies of a bench. Each gives an action, a confidence and a picture."""
+"""The policies for real cameras. Each returns an action, a confidence and a picture."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
 
 Draw = Callable[[str], bytes]
-"""Draws a decision with a title as a PNG."""
+"""A function that draws a decision, with a title, as a PNG."""
 
 
 def _draw_nothing(title: str) -> bytes:
@@ -36,39 +36,40 @@ class Choice:
 
     action: PickPlaceAction
     confidence: float | None
-    """From 0 to 1; None for a rule of geometry without confidence."""
+    """The confidence from 0 to 1; None for a geometric rule without confidence."""
     parts: dict[str, float] = field(default_factory=dict)
-    """The networks' certainty, by part; see `certainty`."""
+    """The certainty of the networks, by part; see `certainty`."""
     draw: Draw = _draw_nothing
-    """Draws the decision as a PNG; an empty title stands for the action's own word."""
+    """Draws the decision as a PNG; with an empty title, the action's own word is the title."""
     reason: str = ""
-    """A sentence on why it acts or stops; empty if the action's own word says enough."""
+    """A sentence that says why the policy acts or stops; empty if the action's own word says
+    enough."""
 
     @classmethod
     def stopped(cls, observation: Observation) -> Choice:
-        """A stop without a decision."""
+        """Returns a stop without a decision."""
         action = PickPlaceAction(stop=True)
         return cls(action, None, draw=partial(_draw_action, observation, action))
 
 
 class BenchPolicy(Protocol):
-    """A policy for a bench."""
+    """A policy for real cameras."""
 
     @property
     def name(self) -> str:
-        """Its name in records."""
+        """The policy's name in records."""
         ...
 
     def check_grid(self, grid: PixelGrid) -> None:
         """Checks that the policy supports observations of this grid.
 
         Raises:
-            UserError: the policy does not.
+            UserError: the policy does not support them.
         """
         ...
 
     def choose(self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()) -> Choice:
-        """The choice for an observation, avoiding failed picks."""
+        """Chooses an action for an observation; avoids the failed picks."""
         ...
 
 
@@ -78,9 +79,10 @@ class ShapeMatchingDecider:
 
     recover: bool = False
     parameters: PickPlaceParameters = field(default_factory=PickPlaceParameters)
-    """How the robot picks and places; give `decide` the same."""
+    """The parameters of the robot's motion; give `decide` the same."""
     least_confidence: float | None = None
-    """The least confidence with which it acts, from 0 to 1; None for the fitted threshold."""
+    """The least confidence, from 0 to 1, with which the policy acts; None for the fitted
+    threshold."""
 
     @property
     def name(self) -> str:
@@ -132,8 +134,8 @@ class _Networks:
         if action.stop:
             return Choice(action, parts.get("nothing_to_pick"), parts, draw)
         if decision.kit_seen is None:
-            # The regression is of decisions by outlines. Without them, the networks' own certainty
-            # counts, and nothing is refused unless the caller says so.
+            # The fitted confidence is for decisions by outlines. For other decisions use the
+            # networks' own certainty, and refuse nothing unless the caller sets a threshold.
             return _if_sure(
                 math.prod(parts.values()), self.least_confidence or 0.0, action, parts, draw
             )
@@ -150,7 +152,7 @@ def _if_sure(
     parts: dict[str, float],
     draw: Draw,
 ) -> Choice:
-    """The action with its confidence, or a stop if that is too low."""
+    """Returns the action with its confidence, or a stop if the confidence is too low."""
     if confidence >= least:
         said = f"the probability of success is {confidence:.2f}"
         return Choice(action, confidence, parts, draw, said)
@@ -167,19 +169,19 @@ def load_policy(
     parameters: PickPlaceParameters | None = None,
     least_confidence: float | None = None,
 ) -> BenchPolicy:
-    """A learned policy, as with `policy: !Learned` in a scenario.
+    """Loads a learned policy, as `policy: !Learned` does in a scenario.
 
     Args:
         weights: a file that `train` wrote; None for the generalist.
-        orientations: N.
-        fit_outlines: True, for tasks with insertion, refines places by outlines and grasps by the
-            jaws' room. False chooses, among equivalent rotations of a place, one that leaves the
-            fingers room to let go.
-        recover: mend failed insertions; see `Recovery`.
-        parameters: how the robot picks and places; None for the cell's defaults. Give `decide` the
-            same.
-        least_confidence: the least confidence with which it acts, from 0 to 1; None for the fitted
-            threshold.
+        orientations: the number N of orientations.
+        fit_outlines: True suits tasks with insertion: places are refined by outlines, and grasps by
+            the room that the jaws have. False chooses, among equivalent rotations of a place, one
+            at which the fingers have room to open.
+        recover: whether to correct failed insertions; see `Recovery`.
+        parameters: the parameters of the robot's motion; None for the simulated cell's defaults.
+            Give `decide` the same.
+        least_confidence: the least confidence, from 0 to 1, with which the policy acts; None for
+            the fitted threshold.
 
     Raises:
         UserError: the file is unusable, or the networks do not support N orientations.

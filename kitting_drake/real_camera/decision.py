@@ -1,4 +1,4 @@
-"""From frames to an action in the robot's base frame, with its heights."""
+"""Turns camera frames into an action in the robot's base frame, with its heights."""
 
 from __future__ import annotations
 
@@ -32,7 +32,8 @@ from systems.signals import (
 from systems.surface_heights import read_surface_heights
 
 _SEEN_TO_STOP = 0.7
-"""If a smaller share of the pixels is seen, an object may be hidden: the policy does nothing."""
+"""The least measured share of the pixels in view. Below it an object may be hidden, so the policy
+does not act."""
 
 
 @dataclass(frozen=True)
@@ -43,24 +44,24 @@ class BenchDecision:
     """`pick and place`, `press`, `done`, `no kit seen`, `nothing fits`, `not sure`, `not seen` or
     `calibration`."""
     reason: str
-    """The same as a sentence."""
+    """A sentence that explains the result."""
     observation: Observation
-    """o_t."""
+    """The observation o_t."""
     seen: float
-    """The seen share of its pixels in view of the cameras, from 0 to 1."""
+    """The measured share, from 0 to 1, of o_t's pixels in view of the cameras."""
     choice: Choice
     surfaces: SurfaceHeights
     heights: MotionHeights
-    """Surfaces and heights are meaningless for a stop."""
+    """The heights of the motion; for a stop they are meaningless."""
     parameters: PickPlaceParameters
     warnings: list[str] = field(default_factory=list)
     """Doubts about the calibration, a sentence each."""
     trajectory: ArmTrajectory | None = None
-    """The joint trajectory of the action; None without a robot, or to stop."""
+    """The joint trajectory of the action; None for a stop or without a robot."""
 
     @property
     def action(self) -> PickPlaceAction:
-        """Pick and place in the base frame; a stop unless the result is an action."""
+        """The pick and place in the base frame; a stop if the result is no action."""
         return self.choice.action
 
     @property
@@ -72,8 +73,8 @@ class BenchDecision:
     def place_height(self) -> float:
         """The height of the fingertips when the object stands at its place, in metres.
 
-        They are then as far above the floor of the place, as o_t shows it, as they were above the
-        object's support at the pick.
+        The fingertips are as far above the floor of the place as they were above the object's
+        support at the pick. The floor's height is read from o_t.
         """
         hanging = max(self.heights.grasp - self.surfaces.support, 0.0)
         return max(self.surfaces.place_floor + hanging, self._lowest)
@@ -83,7 +84,8 @@ class BenchDecision:
         return self.surfaces.table + self.parameters.floor_clearance
 
     def as_dict(self) -> dict[str, Any]:
-        """The content of `action.json`, in metres and radians in the base frame; docs/bench.md."""
+        """Returns the content of `action.json`, in metres and radians in the base frame
+        (docs/bench.md)."""
         action, heights = self.action, self.heights
         result: dict[str, Any] = {
             "result": self.result,
@@ -133,22 +135,24 @@ def decide(
     parameters: PickPlaceParameters | None = None,
     robot: BenchRobot | None = None,
 ) -> BenchDecision:
-    """One decision, with the same heightmap and policies as the simulated cell.
+    """Decides on one action, with the same heightmap and policies as the simulated cell.
 
-    It acts only if the cameras see the table where it should be, if enough is seen of pick and
-    place, and if the action is likely to succeed. With a robot it also must be in reach.
+    The decision is to act only if the cameras see the table where it should be, pick and place are
+    visible enough, and the action is likely to succeed. With a robot, the action must also be in
+    reach.
 
     Args:
         frames: each camera's frame by its name.
         calibration: the cameras' calibration.
-        policy: `load_policy()` or `ShapeMatching()`; make it once.
-        failed_picks: where grasps failed before, in the base frame; it avoids them.
-        parameters: the motion's parameters, which determine its heights; None for the cell's.
-        robot: whose joint trajectory to plan; None: the reach is not checked.
+        policy: `load_policy()` or `ShapeMatching()`; create it once.
+        failed_picks: the poses of failed grasps in the base frame, which the policy avoids.
+        parameters: the parameters of the motion, which determine its heights; None for the
+            simulated cell's defaults.
+        robot: the arm for which to plan a joint trajectory; None: the reach is not checked.
 
     Raises:
-        UserError: frames, calibration and policy do not fit together, or the robot cannot reach
-            its home.
+        UserError: frames, calibration and policy do not fit together, or the robot cannot reach its
+            home.
     """
     policy.check_grid(calibration.grid)
     parameters = PickPlaceParameters() if parameters is None else parameters
@@ -163,7 +167,9 @@ def decide(
     choice = policy.choose(observation, failed_picks)
     action = choice.action
     if action.stop and action.reason != "not seen" and seen < _SEEN_TO_STOP:
-        said = f"only {100 * seen:.0f} % of what is in view is seen: an object may be hidden"
+        said = (
+            f"only {100 * seen:.0f} % of the pixels in view are measured: an object may be hidden"
+        )
         return _stopped("not seen", said, observation, seen, parameters, choice, warnings)
     if action.stop:
         said = choice.reason or STOP_REASONS.get(action.reason, "nothing is left to do")

@@ -34,18 +34,19 @@ from kitting_drake.real_camera.step_actions import StepAction, read_action
 from systems.signals import Observation
 
 TASK = "bench"
-"""The task in the origin of demonstrations from outside; simulated ones have their own."""
+"""The task name in the origin of demonstrations from real cameras; simulated ones have other
+names."""
 _FIRST_SEED = VALIDATION_SEEDS.stop
-"""Simulated episodes have no seeds from here on."""
+"""The first seed that no simulated episode has."""
 
 
 @dataclass(frozen=True)
 class StepFolder:
-    """The frames of one observation, and possibly an `action.json`."""
+    """The folder of one observation's frames, and possibly an `action.json`."""
 
     path: Path
     is_last: bool
-    """Whether it is the last step of its demonstration."""
+    """Whether this is the last step of its demonstration."""
 
     @property
     def name(self) -> str:
@@ -64,10 +65,10 @@ class Summary:
 
 
 def find_demonstrations(folder: Path) -> list[list[StepFolder]]:
-    """The steps of each demonstration in natural order of their names.
+    """Returns the steps of each demonstration, in the natural order of their names.
 
     Args:
-        folder: holds a folder for each demonstration, which holds one for each step.
+        folder: a folder with a folder for each demonstration, which has a folder for each step.
 
     Raises:
         UserError: there is no demonstration, or one has no steps.
@@ -79,18 +80,18 @@ def find_demonstrations(folder: Path) -> list[list[StepFolder]]:
         steps = _subfolders(demonstration)
         if not steps:
             raise UserError(
-                f"{demonstration} holds no steps: a demonstration is a folder that holds a folder "
-                "of frames for each step"
+                f"{demonstration} has no steps: a demonstration is a folder with a folder of "
+                "frames for each step"
             )
         found.append([StepFolder(path, path is steps[-1]) for path in steps])
     if not found:
-        raise UserError(f"{folder} holds no demonstrations: each is a folder in it")
+        raise UserError(f"{folder} has no demonstrations: each must be a folder in it")
     return found
 
 
 def _subfolders(folder: Path) -> list[Path]:
     def key(path: Path) -> list[tuple[int, str]]:
-        # Numbers are at odd positions and are compared by value.
+        # Numbers are at odd positions, and are compared by value.
         parts = re.split(r"(\d+)", path.name)
         return [(int(part) if i % 2 else 0, part) for i, part in enumerate(parts)]
 
@@ -102,10 +103,10 @@ def _subfolders(folder: Path) -> list[Path]:
 
 
 def read_observation(step: Path, calibration: Calibration) -> Observation:
-    """o_t of a step, as in `decide`.
+    """Returns the observation o_t of a step, as in `decide`.
 
     Raises:
-        UserError: its frames are unusable; names the step.
+        UserError: the step's frames are unusable. The message names the step.
     """
     return _observe(step, calibration)[1]
 
@@ -125,8 +126,8 @@ def check_action(step: StepFolder, action: StepAction, calibration: Calibration)
     """Checks that an action fits its step.
 
     Raises:
-        UserError: it stops before the last step, or it was clicked with another calibration, in
-            which the same point has other coordinates.
+        UserError: the action stops before the last step; or it was clicked with another
+            calibration, in which the same point has other coordinates.
     """
     if action.action.stop and not step.is_last:
         raise UserError(
@@ -135,16 +136,16 @@ def check_action(step: StepFolder, action: StepAction, calibration: Calibration)
         )
     if action.calibration not in (None, calibration_digest(calibration)):
         raise UserError(
-            f"{step.name} was clicked with another calibration: give that one with --camera, or "
-            "click it again"
+            f"{step.name} was clicked with another calibration: give that calibration with "
+            "--camera, or click the step again"
         )
 
 
 def check_replaceable(path: Path, folder: Path) -> None:
-    """Checks that a file, if it exists, holds demonstrations of a folder with the same name.
+    """Checks that a file, if it exists, holds demonstrations from a folder of the same name.
 
     Raises:
-        UserError: it holds something else.
+        UserError: the file holds something else.
     """
     if not path.exists():
         return
@@ -160,14 +161,14 @@ def convert(folder: Path, calibration: Calibration, learning: Learning, path: Pa
     """Writes a folder's demonstrations to a file, atomically.
 
     Args:
-        folder: see `find_demonstrations`.
-        calibration: the cameras' calibration, one for all demonstrations.
+        folder: the demonstrations; see `find_demonstrations`.
+        calibration: the cameras' calibration, the same for all demonstrations.
         learning: the assumptions that training may make.
-        path: the file.
+        path: the file to write.
 
     Raises:
         UserError: a step has no action or an invalid one, frames are unusable, two demonstrations
-            are the same, or the file cannot be written. It names the step.
+            are the same, or the file cannot be written. The message names the step.
     """
     labelled = [_labelled(steps, calibration) for steps in find_demonstrations(folder)]
     actions = [[action.as_dict() for _, action in steps] for steps in labelled]
@@ -176,7 +177,7 @@ def convert(folder: Path, calibration: Calibration, learning: Learning, path: Pa
         scenario={
             "task": TASK,
             "calibration": calibration_record(calibration),
-            # The seeds identify the frames, and this digest the actions.
+            # The seeds identify the frames, and this digest identifies the actions.
             "actions": hashlib.sha256(json.dumps(actions).encode()).hexdigest(),
         },
         grid=calibration.grid,
@@ -199,8 +200,8 @@ def _labelled(
         labelled.append((step, action))
     if labelled[0][1].action.stop:
         raise UserError(
-            f"{steps[0].path.parent} holds only a last step, in which nothing is left to do: "
-            "there is nothing to learn from it"
+            f"{steps[0].path.parent} has only a last step, in which nothing is left to do: there "
+            "is nothing to learn from it"
         )
     return labelled
 
@@ -208,7 +209,7 @@ def _labelled(
 def _demonstrations(
     labelled: Sequence[Sequence[tuple[StepFolder, StepAction]]], calibration: Calibration
 ) -> Iterator[Demonstration]:
-    """The demonstrations, one at a time to save memory."""
+    """Yields the demonstrations one at a time, to save memory."""
     names: dict[int, str] = {}
     for steps in labelled:
         digest = hashlib.sha256()
@@ -240,7 +241,7 @@ def _update(digest: hashlib._Hash, frames: dict[str, Frame]) -> None:
 
 
 def _seed(digest: bytes) -> int:
-    """A seed derived from a demonstration's frames.
+    """Returns a seed derived from a demonstration's frames.
 
     `train` compares seeds to find demonstrations that training and validation share.
     """

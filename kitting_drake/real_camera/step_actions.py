@@ -1,4 +1,4 @@
-"""Reads and writes `action.json`, the action of a person or robot for the frame beside it."""
+"""Reads and writes `action.json`: the action of a person or robot for the frame beside it."""
 
 from __future__ import annotations
 
@@ -23,16 +23,18 @@ class StepAction:
     """An action and its labels."""
 
     action: PickPlaceAction
-    """Pick and place in the base frame, or a stop."""
+    """The pick and place in the base frame, or a stop."""
     object: str = UNNAMED
     """The name of the picked object."""
     category: str = ""
-    """Its category, if objects have categories."""
+    """The object's category, or empty if objects have no categories."""
     calibration: str | None = None
-    """The digest of the calibration with which it was clicked; None if it was not clicked."""
+    """The digest of the calibration with which the action was clicked; None if it was not
+    clicked."""
 
     def as_dict(self) -> dict[str, Any]:
-        """The content of `action.json`, in the layout of `decide`, in metres and radians."""
+        """Returns the content of `action.json`, in the layout of `decide`, in metres and
+        radians."""
         result: dict[str, Any] = {
             "units": "metres and radians, in the base frame; docs/bench.md",
             "stop": self.action.stop,
@@ -51,12 +53,12 @@ class StepAction:
 
 
 def parse_action(record: Any, grid: PixelGrid, where: str) -> StepAction:
-    """An action from the content of an `action.json`; unneeded fields are ignored.
+    """Reads an action from the content of an `action.json`; ignores fields that it does not need.
 
     Args:
         record: the content.
-        grid: pick and place must lie on it.
-        where: the beginning of an error.
+        grid: the workspace, in which pick and place must lie.
+        where: the beginning of error messages.
 
     Raises:
         UserError: a field is missing or invalid, or pick or place is outside the workspace.
@@ -69,9 +71,9 @@ def parse_action(record: Any, grid: PixelGrid, where: str) -> StepAction:
     texts = {key: record.get(key) for key in ("object", "category", "calibration")}
     for key, text in texts.items():
         if text is not None and not isinstance(text, str):
-            raise UserError(f"{where}: {key} must be a text, not {text!r}")
+            raise UserError(f"{where}: {key} must be a string, not {text!r}")
         if text and not text.isprintable():
-            raise UserError(f"{where}: {key} must be of printable characters, not {text!r}")
+            raise UserError(f"{where}: {key} must have only printable characters, not {text!r}")
     known = {key: text for key, text in texts.items() if text}
     if record.get("stop", False):
         return StepAction(PickPlaceAction(stop=True), **known)
@@ -91,23 +93,23 @@ def _pose(node: Any, grid: PixelGrid, where: str) -> PlanarPose:
             f"({grid.x_min:g} to {grid.x_max:g}, {grid.y_min:g} to {grid.y_max:g} m)"
         )
     if abs(yaw) > math.tau:
-        raise UserError(f"{where}.yaw is {yaw:g}, more than a rotation: it is in radians")
+        raise UserError(f"{where}.yaw is {yaw:g}, more than a full turn: give it in radians")
     return PlanarPose(x, y, yaw)
 
 
 def read_action(step: Path, grid: PixelGrid) -> StepAction:
-    """The action of a step.
+    """Reads the action of a step.
 
     Args:
-        step: the folder of its frames.
-        grid: as for `parse_action`.
+        step: the folder of the step's frames.
+        grid: the workspace, in which pick and place must lie.
 
     Raises:
-        UserError: the file is missing or invalid; names it.
+        UserError: the file is missing or invalid. The message names it.
     """
     path = step / NAME
     if not path.is_file():
-        raise UserError(f"{step} has no {NAME}: write one, or click it with --click")
+        raise UserError(f"{step} has no {NAME}: write this file, or click the action with --click")
     try:
         record = json.loads(path.read_text())
     except OSError as error:
@@ -118,7 +120,7 @@ def read_action(step: Path, grid: PixelGrid) -> StepAction:
 
 
 def write_action(step: Path, action: StepAction) -> None:
-    """Writes the action of a step, atomically, replacing an existing one.
+    """Writes the action of a step atomically; replaces an existing one.
 
     Raises:
         UserError: the file cannot be written.

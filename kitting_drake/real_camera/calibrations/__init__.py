@@ -1,1 +1,1 @@
-"""Calibrations of real cameras and their YAML layouts."""
+"""Calibrations of real cameras, in the YAML layouts of several tools."""

@@ -54,12 +54,12 @@ from systems.signals import PixelGrid
 Array = NDArray[np.float64]
 
 _HEIGHT = PixelGrid().z_max - PixelGrid().z_min
-"""The default of `max_height`: points higher above the table are ignored, in metres."""
+"""The default of `max_height`, in metres: points higher above the table are ignored."""
 _MOST_PIXELS = 10_000_000
-"""If a workspace has more pixels, its resolution is probably given in a wrong unit."""
+"""The number of pixels of a workspace above which its resolution is probably in a wrong unit."""
 _DEPTH_FIELDS = ("depth_scale", "min_depth", "max_depth")
 _LENS_FILES = ("camera_info", "intrinsics")
-"""Fields that name a file of intrinsics."""
+"""The fields that name a file of intrinsics."""
 _FILE_FIELDS = (*_LENS_FILES, "stream", "resolution")
 _COLOR_FIELDS = (*_FILE_FIELDS, *OWN_INTRINSICS, "depth_to_color")
 _BENCH_FIELDS = ("table_height", "workspace", "verified", *OUTLINE_FIELDS)
@@ -72,34 +72,36 @@ class ColorLens:
 
     intrinsics: Intrinsics
     X_KC: Array
-    """(4, 4): maps points from the depth's optical frame C to the colour's, K."""
+    """A transform (4, 4) from the depth camera's optical frame C to the colour camera's optical
+    frame K."""
 
 
 @dataclass(frozen=True)
 class BenchCamera:
     """An RGB-D camera.
 
-    Usually depth is registered to colour, and one lens describes both. Otherwise `color` has the
-    lens of colour.
+    Depth is usually registered to colour, so that one lens describes both. Otherwise `color`
+    describes the lens of the colour images.
     """
 
     name: str
     intrinsics: Intrinsics
     X_BC: Array
-    """(4, 4): the optical frame C (x right, y down, z forward) in the robot's base frame B."""
+    """The pose (4, 4) of the optical frame C (x right, y down, z forward) in the robot's base frame
+    B."""
     depth_scale: float = 0.001
     """Metres per step of a 16-bit depth image."""
     min_depth: float = 0.01
     max_depth: float = 10.0
-    """Depths outside these limits are ignored, in metres."""
+    """The largest depth in metres; depths outside `min_depth` to `max_depth` are ignored."""
     color: ColorLens | None = None
-    """The colour's own lens; None if depth is registered to colour."""
+    """The lens of the colour images; None if depth is registered to colour."""
     topics: tuple[str, str] | None = None
     """The topics of colour and depth in recordings; None to find them by their names."""
 
     @cached_property
     def rays(self) -> DepthRays:
-        """The pixels' rays.
+        """Returns the rays of the depth image's pixels.
 
         Raises:
             UserError: the distortion cannot be inverted.
@@ -125,16 +127,16 @@ class Calibration:
 
     cameras: tuple[BenchCamera, ...]
     grid: PixelGrid
-    """The pixels of o_t; `z_min` is the height of the table in the base frame."""
+    """The pixels of the observation o_t; `z_min` is the height of the table in the base frame."""
     outline: TableOutline = dataclasses.field(default_factory=TableOutline)
     """The part of the workspace that is table."""
     verified: bool = False
-    """Whether x, y, yaw and the orientation of the image were checked. A bare table does not show
-    errors of these."""
+    """Whether x, y, yaw and the orientation of the image were checked. A bare table cannot show
+    their errors."""
 
     @cached_property
     def region(self) -> NDArray[np.bool_] | None:
-        """(rows, cols): the pixels of o_t that are table; None if all are.
+        """Returns the pixels (rows, cols) of o_t that are on the table, or None if all are.
 
         Raises:
             UserError: the outline misses the workspace.
@@ -142,8 +144,10 @@ class Calibration:
         return self.outline.inside(self.grid)
 
     def contains(self, xy: Array) -> NDArray[np.bool_]:
-        """(...): whether points (..., 2) in the base frame are in the workspace and over the table,
-        at any height."""
+        """Whether points (..., 2) in the base frame are in the workspace and over the table (...).
+
+        Heights are ignored.
+        """
         inside = self.grid.contains(xy)
         if self.region is None:
             return inside
@@ -162,16 +166,16 @@ class Calibration:
 def read_calibration(
     path: Path, *, table_height: float | None = None, poses: bool = True
 ) -> Calibration:
-    """Reads a calibration; `docs/bench.md` describes the layouts.
+    """Reads a calibration from a file; `docs/bench.md` describes the layouts.
 
     Args:
         path: the file.
-        table_height: the table's height in the base frame, in metres. None takes it from the file;
-            if the file has none, it is zero.
+        table_height: the table's height in the base frame, in metres. None: the file's, or zero if
+            the file has none.
         poses: whether cameras must have poses. If not, a missing pose becomes the identity.
 
     Raises:
-        UserError: a field is missing or invalid; names the file and the field.
+        UserError: a field is missing or invalid. The message names the file and the field.
     """
     content = read_yaml(path)
     if "cameras" in content:
@@ -189,10 +193,10 @@ def read_calibration(
         beside: tuple[str, ...] = ()
         entries = with_chained_poses(entries, path)
     else:
-        # A file of another tool may hold a whole camera.
+        # A file of another tool may describe a whole camera.
         content = lens_of_mapping(content, str(path))
         entries = {str(content.get("camera_name", "camera")): content}
-        # A file of one camera has the bench's fields at the same level.
+        # In a file with one camera, the fields of the bench are beside those of the camera.
         beside = (*_BENCH_FIELDS, "camera_name")
     cameras = tuple(
         _read_camera(path, str(name), node, beside, poses) for name, node in entries.items()
@@ -235,23 +239,23 @@ def _read_camera(
 def _read_lens(
     path: Path, name: str, node: dict[str, Any], known: Sequence[str], where: str
 ) -> Intrinsics:
-    """The intrinsics in an entry, or in the file that it names."""
+    """Returns the intrinsics in a camera's entry, or in the file that the entry names."""
     if any(key in node for key in _LENS_FILES):
         check_fields(node, (*_FILE_FIELDS, *known), where)
         return _read_lens_of_file(path, name, node, where)
     if not has_intrinsics(node):
-        # Suggest the fields that could hold the intrinsics.
+        # Suggest fields that could hold the intrinsics.
         lenses = ("cameras", "camera_info", "camera_matrix", "fx")
         check_misspelt(node, lenses, (*known, "camera_name"), where, likeness=0.6)
     return read_intrinsics(node, where)
 
 
 def _check_entry(node: dict[str, Any], known: Sequence[str], where: str) -> None:
-    """Raises UserError for an unknown field of an entry."""
+    """Raises UserError for an unknown field of a camera's entry."""
     if "fx" in node:
         check_fields(node, (*OWN_INTRINSICS, *known, "camera_name"), where)
     elif not any(key in node for key in _LENS_FILES):
-        # OpenCV and ROS write other fields, such as image_height, which are ignored.
+        # Ignore other fields that OpenCV and ROS write, such as image_height.
         check_distortion(node, where)
         check_misspelt(node, (*known, *_BENCH_FIELDS), known, where, likeness=0.85)
 
@@ -280,7 +284,7 @@ def _read_topics(value: Any, where: str) -> tuple[str, str]:
 
 
 def _read_color_lens(path: Path, name: str, node: Any, where: str) -> ColorLens:
-    """The colour's own lens, from the field `color` of a camera's entry."""
+    """Returns the lens of the colour images, from the field `color` of a camera's entry."""
     label = f"{where}: color"
     if not isinstance(node, dict):
         raise UserError(f"{label} must have intrinsics and depth_to_color")
@@ -320,7 +324,8 @@ def _read_grid(path: Path, node: Any, table_height: float) -> PixelGrid:
 
 
 def calibration_record(calibration: Calibration) -> dict[str, Any]:
-    """A calibration in our own layout as YAML and JSON values, without rounding."""
+    """Returns a calibration in this project's own layout, as YAML and JSON values without
+    rounding."""
     grid = calibration.grid
     content: dict[str, Any] = {
         "table_height": float(grid.z_min),
@@ -364,10 +369,10 @@ def _lens_record(lens: Intrinsics) -> dict[str, Any]:
 
 
 def calibration_digest(calibration: Calibration) -> str:
-    """A digest that is equal for equal calibrations in any layout.
+    """Returns a digest that is equal for equal calibrations in any layout.
 
-    Numbers are rounded to nine decimals, because the same rotation as a quaternion and as a matrix
-    may differ in the last bit.
+    Numbers are rounded to nine decimals, because the same rotation, given as a quaternion or as a
+    matrix, may differ in the last bit.
     """
     record = _rounded(calibration_record(dataclasses.replace(calibration, verified=False)))
     if calibration.outline.mask:
@@ -377,7 +382,7 @@ def calibration_digest(calibration: Calibration) -> str:
 
 
 def _rounded(value: Any) -> Any:
-    """A record with rounded numbers and without negative zeros."""
+    """Rounds the numbers in a record, and replaces negative zeros by zeros."""
     if isinstance(value, dict):
         return {key: _rounded(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -386,7 +391,7 @@ def _rounded(value: Any) -> Any:
 
 
 def write_calibration(path: Path, calibration: Calibration) -> None:
-    """Writes a calibration in our own layout, without rounding.
+    """Writes a calibration in this project's own layout, without rounding.
 
     Raises:
         UserError: the file cannot be written.
@@ -396,7 +401,7 @@ def write_calibration(path: Path, calibration: Calibration) -> None:
 
 
 def with_poses(calibration: Calibration, poses: dict[str, Array]) -> Calibration:
-    """A calibration with new poses for some cameras."""
+    """Returns a calibration with new poses (4, 4) for some cameras, by name."""
     cameras = tuple(
         dataclasses.replace(camera, X_BC=poses.get(camera.name, camera.X_BC))
         for camera in calibration.cameras

@@ -1,4 +1,4 @@
-"""Refuses unknown fields, which may be misspelt and would be ignored."""
+"""Refuses unknown fields, because misspelt fields would otherwise be ignored silently."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from kitting_drake.real_camera.calibrations.layouts import OWN_INTRINSICS
 
 
 def check_distortion(node: dict[str, Any], where: str) -> None:
-    """Raises UserError for misspelt distortion coefficients, which would be ignored.
+    """Raises UserError for misspelt distortion coefficients.
 
     OpenCV and ROS write no other fields that begin with "dist".
     """
@@ -24,7 +24,7 @@ def check_distortion(node: dict[str, Any], where: str) -> None:
 
 
 def check_fields(node: dict[str, Any], known: Sequence[str], where: str) -> None:
-    """Raises UserError for an unknown field, which would be ignored."""
+    """Raises UserError for an unknown field."""
     for key in node:
         if key not in known:
             close = difflib.get_close_matches(str(key), known, n=1)
@@ -38,11 +38,11 @@ def check_misspelt(
     """Raises UserError for an unknown field that resembles an expected one.
 
     Args:
-        node: the fields.
-        meant: the expected fields.
-        known: fields that are allowed.
-        where: the beginning of the error.
-        likeness: the least similarity, from 0 to 1.
+        node: the fields to check.
+        meant: the names of the expected fields.
+        known: the names of fields that are allowed.
+        where: the beginning of the error message.
+        likeness: the least similarity of two names, from 0 to 1.
     """
     for key in node:
         close = difflib.get_close_matches(str(key), meant, cutoff=likeness)

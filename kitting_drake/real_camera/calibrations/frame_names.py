@@ -1,4 +1,4 @@
-"""Tells from ROS's frame names which of two frames is the base, the hand or the camera."""
+"""Infers from ROS's frame names which of two frames is the base, the hand or the camera."""
 
 from __future__ import annotations
 
@@ -19,46 +19,49 @@ _WORDS = {
     HAND: r"hand|tool|flange|gripper|tcp|effector|wrist|(^|[_/-])ee([_/-]|$)|link_?[5-8]$|axis",
     BASE: r"base|world|map|robot|table|link_?0$",
 }
-"""Patterns in the names of frames. The first that fits counts, so camera_base is a camera."""
+"""Patterns in the names of frames. The first pattern that matches decides, so `camera_base` is a
+camera."""
 _BODY = r"(link|base|base[_-]frame|screw[_-]frame|camera[_-]frame)$"
-"""Names of cameras' bodies, whose x points forward, as ROS's drivers give them."""
+"""The pattern of names of a camera's body frame (x forward), as ROS's drivers name it."""
 
 
 @dataclass(frozen=True)
 class FoundPose:
-    """A pose in a file: of the frame `child` in the frame `parent`, as in ROS."""
+    """A pose in a file: that of the frame `child` in the frame `parent`, as in ROS."""
 
     X: Array
-    """(4, 4): maps points from `child` to `parent`."""
+    """A transform (4, 4) that maps points from `child` to `parent`."""
     where: str
-    """The file or field, for errors."""
+    """The file or field, for error messages."""
     parent: str = ""
     child: str = ""
-    """The frames' names; empty if the file does not say."""
+    """The name of the frame `child`; empty if the file does not give it. The same holds for
+    `parent`."""
     in_hand: bool | None = None
-    """Whether the camera is on the hand; None if only the names may tell."""
+    """Whether the camera is on the hand; None if the file does not say it."""
 
     @property
     def inverse(self) -> FoundPose:
-        """The pose of `parent` in `child`."""
+        """Returns the pose of `parent` in `child`."""
         X = np.asarray(np.linalg.inv(self.X), dtype=float)
         return FoundPose(X, self.where, self.child, self.parent, self.in_hand)
 
 
 @dataclass(frozen=True)
 class FrameNames:
-    """The frames' names that a user gives if a file's are ambiguous; empty if not given."""
+    """The names of the base and camera frames that a user gives for ambiguous files; else empty."""
 
     base: str = ""
     camera: str = ""
 
     @staticmethod
     def of(node: dict[str, Any]) -> FrameNames:
-        """From the fields `base_frame` and `camera_frame`."""
+        """Reads the fields `base_frame` and `camera_frame` of a camera's entry."""
         return FrameNames(str(node.get("base_frame", "")), str(node.get("camera_frame", "")))
 
     def kind(self, name: str) -> str:
-        """BASE, HAND, CAMERA, or an empty text if the name does not tell."""
+        """Returns BASE, HAND or CAMERA for a frame's name, or "" if the name does not show its
+        kind."""
         plain = name.strip("/")
         if plain and plain == self.base.strip("/"):
             return BASE
@@ -71,13 +74,14 @@ class FrameNames:
 
 
 def directed(found: FoundPose, names: FrameNames) -> FoundPose:
-    """The pose of the camera, in the base or the hand: inverted if its frames' names say so.
+    """Returns the pose of the camera in the base or the hand, inverted if the frame names require
+    it.
 
-    If there are no names, it is taken as the pose of the camera in the base. A hand-eye calibration
-    says itself which pose it holds.
+    Without names, the pose is taken as that of the camera in the base. A hand-eye calibration
+    states itself which pose it holds.
 
     Raises:
-        UserError: the names do not tell, or neither frame is a camera.
+        UserError: the names are ambiguous, or neither frame is a camera.
     """
     if not found.parent or not found.child or found.in_hand is not None:
         return found
@@ -86,14 +90,14 @@ def directed(found: FoundPose, names: FrameNames) -> FoundPose:
         found, kinds = found.inverse, (kinds[1], CAMERA)
     if kinds[1] != CAMERA or kinds[0] not in (BASE, HAND):
         raise UserError(
-            f"{found.where} is a transform of {found.child} in {found.parent}, and the names do "
-            "not tell which is the robot's base and which the camera: give base_frame and "
+            f"{found.where} is a transform of {found.child} in {found.parent}, and it is not "
+            "clear which is the robot's base and which the camera: give base_frame and "
             "camera_frame beside it"
         )
     return FoundPose(found.X, found.where, found.parent, found.child, kinds[0] == HAND)
 
 
 def is_body(name: str) -> bool:
-    """Whether the name is that of a camera's body instead of its optical frame."""
+    """Whether a name is that of a camera's body frame instead of its optical frame."""
     plain = name.lower()
     return "optical" not in plain and re.search(_BODY, plain) is not None

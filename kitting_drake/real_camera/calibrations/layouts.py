@@ -1,4 +1,4 @@
-"""Intrinsics of cameras from mappings: OpenCV's layout, ROS's CameraInfo, and our own."""
+"""Reads intrinsics of cameras from mappings: OpenCV's layout, ROS's CameraInfo, and our own."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from kitting_drake.real_camera.calibrations.lens_distortion import (
 from kitting_drake.real_camera.calibrations.yaml_values import matrix, number, numbers, whole_number
 
 _SKEW = 1e-3
-"""A smaller skew, in pixels, is rounding."""
+"""The largest skew, in pixels, that counts as rounding."""
 _MATRICES = ("camera_matrix", "k", "K", "Camera_Matrix")
 _WIDTHS = ("width", "image_width", "image_Width")
 _HEIGHTS = ("height", "image_height", "image_Height")
@@ -29,28 +29,28 @@ OWN_INTRINSICS = (
     *("fx", "fy", "cx", "cy", "image_size", *_WIDTHS, *_HEIGHTS),
     *("distortion_model", *_DISTORTIONS),
 )
-"""The fields of intrinsics in our own layout; other fields of OpenCV and ROS are ignored."""
+"""The fields of intrinsics in our own layout. Other fields of OpenCV and ROS are ignored."""
 
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """The intrinsics of a lens; image positions are whole numbers at pixel centres."""
+    """The intrinsics of a lens; pixel centres have whole-number image coordinates."""
 
     size: tuple[int, int]
-    """(width, height), in pixels."""
+    """The (width, height) of the images, in pixels."""
     focal: tuple[float, float]
-    """(fx, fy), in pixels."""
+    """The focal lengths (fx, fy), in pixels."""
     centre: tuple[float, float]
-    """(cx, cy), in pixels."""
+    """The principal point (cx, cy), in pixels."""
     distortion: tuple[float, ...] = ()
-    """By default k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 in the order of OpenCV and ROS;
-    fewer, or none."""
+    """The distortion coefficients. For the default model they are k1, k2, p1, p2, k3, k4, k5, k6,
+    s1, s2, s3, s4, in the order of OpenCV and ROS, or the first few of these."""
     model: str = BROWN
-    """The model of the distortion, as in `lens_distortion.py`."""
+    """The distortion model, one of those in `lens_distortion.py`."""
 
 
 def has_intrinsics(node: dict[str, Any]) -> bool:
-    """Whether a mapping holds intrinsics in some layout."""
+    """Whether a mapping holds intrinsics in one of the three layouts."""
     return any(key in node for key in ("fx", *_MATRICES))
 
 
@@ -58,7 +58,7 @@ def read_intrinsics(node: dict[str, Any], where: str) -> Intrinsics:
     """Reads the intrinsics in a mapping, in any of the three layouts.
 
     Raises:
-        UserError: a field is missing or invalid; names the field.
+        UserError: a field is missing or invalid. The message names the field.
     """
     fx, fy, cx, cy = _read_pinhole(node, where)
     if "image_size" in node:
@@ -82,7 +82,7 @@ def read_intrinsics(node: dict[str, Any], where: str) -> Intrinsics:
 
 
 def _read_pinhole(node: dict[str, Any], where: str) -> tuple[float, float, float, float]:
-    """fx, fy, cx, cy, in pixels."""
+    """Returns fx, fy, cx, cy, in pixels."""
     if "fx" in node:
         fx, fy, cx, cy = (
             number(get(node, key, where), f"{where}: {key}") for key in ("fx", "fy", "cx", "cy")
@@ -106,13 +106,15 @@ def _read_pinhole(node: dict[str, Any], where: str) -> tuple[float, float, float
 
 
 def _check_cropped(node: dict[str, Any], size: tuple[int, int], where: str) -> None:
-    """Raises UserError for a CameraInfo whose images are binned or cropped: its width, height and k
-    are those of the full image."""
+    """Raises UserError for a CameraInfo of binned or cropped images.
+
+    Its width, height and k are those of the full image.
+    """
     for key in ("binning_x", "binning_y"):
         if number(node.get(key, 0), f"{where}: {key}") > 1:
             raise UserError(
-                f"{where}: {key} is {node[key]}, so images are smaller than its k says: give the "
-                "intrinsics of the images as they arrive, without binning"
+                f"{where}: {key} is {node[key]}, so the images are smaller than k assumes: give "
+                "the intrinsics of the images as they arrive, without binning"
             )
     roi = node.get("roi")
     if not isinstance(roi, dict):
@@ -124,13 +126,13 @@ def _check_cropped(node: dict[str, Any], size: tuple[int, int], where: str) -> N
     if any(values) and values != [0, 0, *size]:
         raise UserError(
             f"{where}: roi is {values[2]:g}x{values[3]:g} pixels at ({values[0]:g}, "
-            f"{values[1]:g}), so images are cropped: subtract its offset from cx and cy, give its "
-            "width and height, and remove roi"
+            f"{values[1]:g}), so the images are cropped: subtract the offset of roi from cx and "
+            "cy, give its width and height, and remove roi"
         )
 
 
 def _read_distortion(node: dict[str, Any], where: str) -> tuple[tuple[float, ...], str]:
-    """The coefficients and their model."""
+    """Returns the distortion coefficients and their model."""
     model = known_model(node.get("distortion_model"), where)
     key = refuse_two(node, _DISTORTIONS, where)
     if key is None:
@@ -143,14 +145,15 @@ def _read_distortion(node: dict[str, Any], where: str) -> tuple[tuple[float, ...
 
 
 def get(node: dict[str, Any], key: str, where: str) -> Any:
-    """A field; raises UserError if it is missing."""
+    """Returns a field of a mapping; raises UserError if it is missing."""
     if key not in node:
         raise UserError(f"{where} lacks '{key}'")
     return node[key]
 
 
 def refuse_two(node: dict[str, Any], keys: tuple[str, ...], where: str) -> str | None:
-    """The one of some fields that is given, or None; raises UserError if several are."""
+    """Returns the one of several fields that is given, or None; raises UserError if more than one
+    is."""
     given = [key for key in keys if key in node]
     if len(given) > 1:
         raise UserError(f"{where} has {' and '.join(given)}: give one of them")

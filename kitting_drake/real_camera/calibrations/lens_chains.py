@@ -1,4 +1,4 @@
-"""Poses of cameras that kalibr calibrated together, from the pose of one of them."""
+"""Computes poses of cameras that kalibr calibrated together, from the pose of one of them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _LENS_FILES = ("camera_info", "intrinsics")
 
 
 def with_chained_poses(entries: dict[str, Any], path: Path) -> dict[str, Any]:
-    """The entries of a calibration, with poses for more cameras.
+    """Adds poses to the entries of a calibration.
 
     A camera without a pose gets `camera_to_base` if another camera of the same kalibr camchain has
     a pose.
@@ -30,8 +30,8 @@ def with_chained_poses(entries: dict[str, Any], path: Path) -> dict[str, Any]:
         path: the calibration's file.
 
     Raises:
-        UserError: the chain is broken, or several of its cameras have poses, which might contradict
-            one another.
+        UserError: the chain is broken, or several of its cameras have poses, which could contradict
+            each other.
     """
     lacking = [
         name
@@ -51,7 +51,7 @@ def with_chained_poses(entries: dict[str, Any], path: Path) -> dict[str, Any]:
             continue
         if len(others) > 1:
             raise UserError(
-                f"{path}: camera {name} has no pose, but several of its camchain do "
+                f"{path}: camera {name} has no pose, but several cameras of its camchain have one "
                 f"({', '.join(others)}): keep the pose of only one of them"
             )
         ((other, entry),) = others.items()
@@ -65,7 +65,7 @@ def with_chained_poses(entries: dict[str, Any], path: Path) -> dict[str, Any]:
 
 
 def _chain(node: dict[str, Any], path: Path) -> Path | None:
-    """The camchain that an entry names, or None."""
+    """Returns the camchain file that an entry names, or None."""
     names = [str(node[key]) for key in _LENS_FILES if key in node]
     if len(names) != 1 or not names[0].endswith((".yaml", ".yml")):
         return None
@@ -74,7 +74,7 @@ def _chain(node: dict[str, Any], path: Path) -> Path | None:
 
 
 def _from_first(node: dict[str, Any], name: str, path: Path) -> Array:
-    """(4, 4): maps points from the chain's first camera to that of an entry."""
+    """Returns the transform (4, 4) from the chain's first camera to the camera of an entry."""
     file = _chain(node, path)
     assert file is not None
     cameras = kalibr_cameras(read_yaml(file))
@@ -84,6 +84,6 @@ def _from_first(node: dict[str, Any], name: str, path: Path) -> Array:
     for item in ordered[1 : ordered.index(last) + 1]:
         if "T_cn_cnm1" not in cameras[item]:
             raise UserError(f"{file}: {item} lacks T_cn_cnm1, the chain from the camera before it")
-        # T_cn_cnm1 maps points from the camera before to this one.
+        # T_cn_cnm1 maps points from the previous camera to this one.
         X = pose_of_value(cameras[item]["T_cn_cnm1"], f"{file}: {item}: T_cn_cnm1").X @ X
     return X

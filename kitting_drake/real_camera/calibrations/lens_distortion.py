@@ -1,4 +1,5 @@
-"""The distortion of lenses: Brown-Conrady as in OpenCV, its inverse, and equidistant (fisheye)."""
+"""Lens distortion: OpenCV's Brown-Conrady model, its inverse, and the equidistant (fisheye)
+model."""
 
 from __future__ import annotations
 
@@ -12,9 +13,10 @@ Array = NDArray[np.float64]
 BROWN = ""
 """OpenCV's model: k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4."""
 INVERSE_BROWN = "inverse_brown_conrady"
-"""Librealsense's: the polynomial maps from distorted to straight rays; k1, k2, p1, p2, k3."""
+"""Librealsense's model, whose polynomial maps distorted rays to undistorted ones: k1, k2, p1, p2,
+k3."""
 EQUIDISTANT = "equidistant"
-"""Kalibr's, ROS's and cv2.fisheye's: k1, k2, k3, k4 of the angle from the optical axis."""
+"""The model of Kalibr, ROS and cv2.fisheye: k1, k2, k3, k4 of the angle from the optical axis."""
 _MODELS = {
     **dict.fromkeys(("", "plumb_bob", "rational_polynomial", "radtan", "none"), BROWN),
     **dict.fromkeys(("brown_conrady", "brown", "opencv"), BROWN),
@@ -23,18 +25,19 @@ _MODELS = {
 }
 _COUNTS = {BROWN: (0, 4, 5, 8, 12, 14), INVERSE_BROWN: (0, 5), EQUIDISTANT: (4,)}
 _THIN_PRISM, _TILT = 8, 12
-"""From these coefficients on, OpenCV's are of a thin prism and of a tilted sensor."""
+"""The numbers of coefficients in OpenCV's list before those of a thin prism, and before those of a
+tilted sensor."""
 _UNDONE = 1e-4
-"""The largest error of an undistorted ray, distorted again, at depth 1."""
+"""The largest error of a ray that is undistorted and distorted again, at depth 1."""
 _WIDEST = np.deg2rad(85)
-"""The largest angle of a ray from the optical axis."""
+"""The largest angle of a ray from the optical axis, in radians."""
 
 
 def known_model(name: object, where: str) -> str:
-    """One of this module's models, from any of its usual names.
+    """Returns the model that a usual name stands for.
 
     Raises:
-        UserError: it is another model.
+        UserError: this module has no such model.
     """
     key = str(name or "").strip().lower().replace(" ", "_").replace("-", "_")
     if key not in _MODELS:
@@ -46,15 +49,15 @@ def known_model(name: object, where: str) -> str:
 
 
 def checked_coefficients(model: str, values: tuple[float, ...], where: str) -> tuple[float, ...]:
-    """The coefficients without trailing groups of zeros.
+    """Returns the coefficients without trailing groups of zeros.
 
     Args:
-        model: one of this module's.
+        model: one of this module's models.
         values: the coefficients.
-        where: the beginning of the error.
+        where: the beginning of the error message.
 
     Raises:
-        UserError: their count is wrong, or they tilt the sensor.
+        UserError: the number of coefficients is wrong, or they tilt the sensor.
     """
     if model != EQUIDISTANT and not any(values):
         return ()
@@ -73,7 +76,8 @@ def checked_coefficients(model: str, values: tuple[float, ...], where: str) -> t
 
 
 def distort(x: Array, y: Array, model: str, values: tuple[float, ...]) -> tuple[Array, Array]:
-    """Applies a lens's distortion to straight rays (x, y, 1); returns x and y at depth 1."""
+    """Applies a lens's distortion to undistorted rays (x, y, 1); returns the new x and y at depth
+    1."""
     if model == EQUIDISTANT:
         radius = np.hypot(x, y)
         angle = np.arctan(radius)
@@ -87,10 +91,10 @@ def distort(x: Array, y: Array, model: str, values: tuple[float, ...]) -> tuple[
 def undistort(
     u: Array, v: Array, model: str, values: tuple[float, ...], name: str
 ) -> tuple[Array, Array]:
-    """The straight rays (x, y, 1) that a lens images at (u, v), at depth 1.
+    """Returns the undistorted rays (x, y, 1) that a lens images at (u, v), at depth 1.
 
     Raises:
-        UserError: the distortion cannot be inverted there; names the camera.
+        UserError: the distortion cannot be inverted at some point. The message names the camera.
     """
     if model == INVERSE_BROWN:
         return _brown(u, v, values)
@@ -101,8 +105,8 @@ def undistort(
     if not (missed < _UNDONE).all():
         order = "k1, k2, k3, k4" if model == EQUIDISTANT else "k1, k2, p1, p2, k3"
         raise UserError(
-            f"camera {name}: its distortion cannot be undone over the whole image: check the order "
-            f"{order}, or rectify the images"
+            f"camera {name}: its distortion cannot be inverted over the whole image: check the "
+            f"order {order}, or rectify the images"
         )
     return x, y
 
@@ -124,7 +128,8 @@ def _factors(x: Array, y: Array, values: tuple[float, ...]) -> tuple[Array, Arra
 
 
 def _undo_brown(u: Array, v: Array, values: tuple[float, ...]) -> tuple[Array, Array, Array]:
-    """The rays and their errors, by the iteration of cv2.undistortPoints."""
+    """Returns the undistorted rays x, y and their errors, by the iteration of
+    cv2.undistortPoints."""
     x, y = u.copy(), v.copy()
     with np.errstate(all="ignore"):
         for _ in range(30):
@@ -142,7 +147,10 @@ def _bent(angle: Array, values: tuple[float, ...]) -> Array:
 
 
 def _undo_equidistant(u: Array, v: Array, values: tuple[float, ...]) -> tuple[Array, Array, Array]:
-    """The rays and their errors, by Newton's method for the angle from the optical axis."""
+    """Returns the undistorted rays x, y and their errors.
+
+    Newton's method finds the angle from the optical axis.
+    """
     k1, k2, k3, k4 = values
     bent = np.hypot(u, v)
     angle = bent.copy()

@@ -1,4 +1,4 @@
-"""Intrinsics from files of kalibr, Open3D and RealSense, as mappings in our own layout."""
+"""Reads intrinsics from files of kalibr, Open3D and RealSense, as mappings in our own layout."""
 
 from __future__ import annotations
 
@@ -24,19 +24,20 @@ _REALSENSE_FIELDS = ("Width", "Height", "PPX", "PPY", "Fx", "Fy", "Distortion", 
 _PRINTED = re.compile(
     r"\[\s*(\d+)x(\d+)\s+p\[([^\]]+)\]\s+f\[([^\]]+)\]\s+([A-Za-z ]+?)\s*\[([^\]]*)\]\s*\]"
 )
-"""The text of pyrealsense2.intrinsics."""
+"""The text form of pyrealsense2.intrinsics."""
 _PYREALSENSE = {**{key: key for key in ("width", "height", "fx", "fy")}, "cx": "ppx", "cy": "ppy"}
 _RECTIFIED = ("none", "brown conrady", "")
 
 
 def read_lens_file(path: Path, stream: str, resolution: tuple[int, int] | None) -> dict[str, Any]:
-    """The intrinsics in a file, as fields that `read_intrinsics` knows.
+    """Reads the intrinsics in a file, as fields that `read_intrinsics` knows.
 
     Args:
         path: the file, or a recording with a CameraInfo.
-        stream: which lens to take if there are several: kalibr's cam1, RealSense's Color, or a
-            topic. The name of the camera is also possible; it counts only if it fits one of them.
-        resolution: (width, height) of RealSense's streams, in pixels; None if there is only one.
+        stream: the lens to take if there are several: kalibr's cam1, RealSense's Color, or a topic.
+            The camera's name may also be given; it is used only if it matches a lens.
+        resolution: the (width, height) of one of RealSense's streams, in pixels; None if there is
+            only one.
 
     Raises:
         UserError: the file is unreadable, or holds no such lens.
@@ -56,19 +57,21 @@ def read_lens_file(path: Path, stream: str, resolution: tuple[int, int] | None) 
 
 
 def lens_of_mapping(content: dict[str, Any], where: str, stream: str = "") -> dict[str, Any]:
-    """The intrinsics in a mapping, as fields that `read_intrinsics` knows.
+    """Converts the intrinsics in a mapping to fields that `read_intrinsics` knows.
 
     A mapping that is not in the layout of another tool is returned unchanged.
 
     Raises:
-        UserError: the layout has several lenses, or a lens that is not a pinhole's.
+        UserError: the layout has several lenses, or a lens without a pinhole model.
     """
     if kalibr_cameras(content):
         return _kalibr(content, where, stream)
     if content.get("class_name") == "PinholeCameraTrajectory":
         parameters = content.get("parameters")
         if not isinstance(parameters, list) or len(parameters) != 1:
-            raise UserError(f"{where} has cameras at several times: save the parameters of one")
+            raise UserError(
+                f"{where} has cameras at several times: save the parameters of one time"
+            )
         content = parameters[0]
     if "intrinsic" in content or "intrinsic_matrix" in content:
         return _open3d(content, where)
@@ -78,14 +81,15 @@ def lens_of_mapping(content: dict[str, Any], where: str, stream: str = "") -> di
         return {**lens, **_librealsense(str(content.get("model", "")), values, where)}
     if "CalibrationInformation" in content:
         raise UserError(
-            f"{where} is the raw calibration of an Azure Kinect, for another resolution than its "
-            "images: give the CameraInfo, or the intrinsic.json that Open3D writes"
+            f"{where} is the raw calibration of an Azure Kinect, which is for another resolution "
+            "than that of its images: give the CameraInfo, or the intrinsic.json that Open3D "
+            "writes"
         )
     return content
 
 
 def kalibr_cameras(content: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """The cameras of kalibr's camchain, by name; empty if the content is no camchain."""
+    """Returns the cameras of kalibr's camchain by name; none if the content is not a camchain."""
     return {
         str(name): node
         for name, node in content.items()
@@ -96,10 +100,10 @@ def kalibr_cameras(content: dict[str, Any]) -> dict[str, dict[str, Any]]:
 
 
 def kalibr_stream(cameras: dict[str, dict[str, Any]], where: str, stream: str) -> str:
-    """The kalibr camera that `stream` names, or whose topic has `stream` as a part.
+    """Returns the kalibr camera whose name is `stream`, or whose topic contains `stream`.
 
     Raises:
-        UserError: no single camera fits.
+        UserError: no camera matches, or several do.
     """
     if stream in cameras:
         return stream
@@ -133,7 +137,7 @@ def _kalibr(content: dict[str, Any], where: str, stream: str) -> dict[str, Any]:
 
 
 def _open3d(content: dict[str, Any], where: str) -> dict[str, Any]:
-    """Open3D's intrinsics: PinholeCameraIntrinsic, PinholeCameraParameters, or a recorder's."""
+    """Converts Open3D's PinholeCameraIntrinsic, PinholeCameraParameters or recorder intrinsics."""
     inner = content.get("intrinsic", content)
     if not isinstance(inner, dict):
         raise UserError(f"{where}: intrinsic must have width, height and intrinsic_matrix")
@@ -152,7 +156,8 @@ def _open3d(content: dict[str, Any], where: str) -> dict[str, Any]:
 def _realsense_text(
     text: str, path: Path, stream: str, resolution: tuple[int, int] | None
 ) -> dict[str, Any]:
-    """The intrinsics from `rs-enumerate-devices -c`: a block for each stream and resolution."""
+    """Reads the text of `rs-enumerate-devices -c`, which has a block for each stream and
+    resolution."""
     heads = list(_REALSENSE.finditer(text))
     names = {head.group(1) for head in heads}
     wanted = stream if stream in names else "Color"
@@ -168,7 +173,7 @@ def _realsense_text(
         sizes = sorted({key.partition(" ")[0] for key in lenses})
         told = f"sizes {', '.join(sizes)}: give resolution: [WIDTH, HEIGHT]" if lenses else "none"
         raise UserError(
-            f"{path}: of the stream {wanted}{size} there are {len(lenses)} intrinsics: {told}"
+            f"{path}: there are {len(lenses)} intrinsics of the stream {wanted}{size}: {told}"
         )
     return next(iter(lenses.values()))
 
@@ -190,7 +195,8 @@ def _realsense_block(text: str, where: str) -> dict[str, Any]:
 
 
 def _librealsense(model: str, values: list[Any], where: str) -> dict[str, Any]:
-    """The distortion, by librealsense's name of its model, such as distortion.brown_conrady."""
+    """Converts a distortion with librealsense's name of its model, such as
+    distortion.brown_conrady."""
     name = model.rpartition(".")[2].replace("_", " ").lower()
     coefficients = numbers(values, f"{where}: coefficients")
     if not np.any(coefficients):
@@ -203,9 +209,10 @@ def _librealsense(model: str, values: list[Any], where: str) -> dict[str, Any]:
 
 
 def check_lens(lens: dict[str, Any], path: Path) -> None:
-    """Raises UserError if a mapping of a file has no intrinsics."""
+    """Raises UserError if a mapping from a file has no intrinsics."""
     if not has_intrinsics(lens):
         raise UserError(
             f"{path} has neither camera_matrix nor k: it must be a CameraInfo, a calibration of "
-            "OpenCV or kalibr, Open3D's intrinsics, or what rs-enumerate-devices -c prints"
+            "OpenCV or kalibr, Open3D's intrinsics, or the text that rs-enumerate-devices -c "
+            "prints"
         )

@@ -1,4 +1,5 @@
-"""Poses from files: of tf2_echo, hand-eye calibrations, MoveIt, Open3D, and plain matrices."""
+"""Reads poses from files: of tf2_echo, hand-eye calibrations, MoveIt, Open3D, and plain
+matrices."""
 
 from __future__ import annotations
 
@@ -29,10 +30,10 @@ from kitting_drake.real_camera.calibrations.yaml_values import (
 Array = NDArray[np.float64]
 
 _ROUNDED = 2e-3
-"""The tolerance for a quaternion of tf2_echo, which has three decimals."""
+"""The tolerance for a quaternion of tf2_echo, which prints three decimals."""
 _STILL = 2e-3
-"""If repeated lines of tf2_echo differ by more, the frame moves; in metres, or in the numbers of a
-quaternion."""
+"""The largest difference between repeated outputs of tf2_echo for a frame at rest, in metres, or in
+the numbers of a quaternion."""
 _NUMBERS = r"\[\s*([^\]]*?)\s*\]"
 _ECHO = re.compile(rf"Translation:\s*{_NUMBERS}.*?in Quaternion(?:\s*\(xyzw\))?\s*{_NUMBERS}", re.S)
 _ECHO_CALL = re.compile(r"\btf2?_echo[ \t]+([\w/.-]+)[ \t]+([\w/.-]+)")
@@ -44,7 +45,7 @@ _KNOWN = (
 
 
 def read_pose_file(path: Path) -> list[FoundPose]:
-    """The poses in a file. Only files of static publishers and /tf_static can hold several.
+    """Reads the poses in a file. Only files of static publishers and /tf_static can hold several.
 
     Raises:
         UserError: the file is unreadable, incomplete, or of an unknown layout.
@@ -77,7 +78,7 @@ def _load_matrix(path: Path) -> Array:
 
 
 def _plain_numbers(text: str) -> list[str] | None:
-    """The numbers of a text that holds nothing else, as np.savetxt writes it; else None."""
+    """Returns the numbers of a text that holds only numbers, as np.savetxt writes it; else None."""
     words = re.sub(r"#[^\n]*", "", text).replace(",", " ").replace(";", " ").split()
     try:
         return words if [float(word) for word in words] else None
@@ -86,24 +87,31 @@ def _plain_numbers(text: str) -> list[str] | None:
 
 
 def _pose_of_echo(text: str, path: Path) -> FoundPose:
-    """The last pose that tf2_echo, or tf_echo of ROS 1, printed."""
+    """Returns the last pose that tf2_echo, or tf_echo of ROS 1, printed."""
     found = _ECHO.findall(text)
     if not found:
-        raise UserError(f"{path} is not complete: tf2_echo prints a Translation and a Quaternion")
+        raise UserError(
+            f"{path} is not complete: tf2_echo prints both a Translation and a Quaternion"
+        )
     values = [
         [number(word, str(path)) for word in re.split(r"[\s,]+", " ".join(pair).strip())]
         for pair in found
     ]
     if any(len(row) != 7 for row in values):
-        raise UserError(f"{path} must have three numbers of Translation and four of Quaternion")
+        raise UserError(
+            f"{path} must have three numbers after Translation and four after Quaternion"
+        )
     table = np.array(values)
     # A quaternion and its negative are the same rotation.
     table[:, 3:] *= np.where(table[:, 3:] @ table[-1, 3:] < 0, -1, 1)[:, None]
     if np.ptp(table, axis=0).max() > _STILL:
-        raise UserError(f"{path}: the frame moves between its {len(table)} poses: give only one")
+        raise UserError(
+            f"{path}: the frame moves between the {len(table)} poses of the file: "
+            "give only one pose"
+        )
     calls = set(_ECHO_CALL.findall(text))
     if len(calls) > 1:
-        raise UserError(f"{path} has poses of several pairs of frames: give only one")
+        raise UserError(f"{path} has poses of several pairs of frames: give only one pair")
     parent, child = calls.pop() if calls else ("", "")
     R = rotation_of_quaternion(table[-1, 3:], f"{path}: Quaternion", _ROUNDED)
     X = rigid(assembled(R, table[-1, :3]), str(path))
@@ -115,7 +123,7 @@ def _poses_of_mapping(content: dict[str, Any], where: str) -> list[FoundPose]:
     parameters = content.get("parameters")
     if content.get("class_name") == "PinholeCameraTrajectory":
         if not isinstance(parameters, list) or len(parameters) != 1:
-            raise UserError(f"{where} has poses at several times: save the parameters of one")
+            raise UserError(f"{where} has poses at several times: save the parameters of one time")
         content = parameters[0] if isinstance(parameters[0], dict) else {}
     if "extrinsic" in content:
         return [FoundPose(open3d_pose(content, where), where)]
@@ -132,8 +140,10 @@ def _poses_of_mapping(content: dict[str, Any], where: str) -> list[FoundPose]:
 
 
 def open3d_pose(content: dict[str, Any], where: str) -> Array:
-    """(4, 4): the pose of the camera, from Open3D's `extrinsic`, which maps from the world to the
-    camera and is stored column by column."""
+    """Returns the pose (4, 4) of the camera from Open3D's `extrinsic`.
+
+    The field maps from the world to the camera, and is stored column by column.
+    """
     value = content["extrinsic"]
     if isinstance(value, list) and any(isinstance(item, list) for item in value):
         raise UserError(
@@ -145,7 +155,8 @@ def open3d_pose(content: dict[str, Any], where: str) -> Array:
 
 
 def _easy_handeye(content: dict[str, Any], where: str) -> FoundPose:
-    """The pose in a file of easy_handeye for ROS 1, whose older versions have no `parameters`."""
+    """Reads the pose in a file of easy_handeye for ROS 1, whose older versions have no
+    `parameters`."""
     inner = content.get("parameters", content)
     if not isinstance(inner, dict) or not isinstance(inner.get("eye_on_hand"), bool):
         raise UserError(f"{where} lacks eye_on_hand: true or false")

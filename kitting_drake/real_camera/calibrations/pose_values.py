@@ -1,4 +1,4 @@
-"""Poses from mappings: matrices, positions with rotations, and ROS's messages."""
+"""Reads poses from mappings: matrices, positions with rotations, and ROS's messages."""
 
 from __future__ import annotations
 
@@ -17,21 +17,22 @@ from kitting_drake.real_camera.calibrations.yaml_values import matrix, numbers
 Array = NDArray[np.float64]
 
 _ORTHOGONAL = 1e-3
-"""The largest difference of an entry of R^T R from the identity's."""
+"""The largest difference between an entry of R^T R and that of the identity."""
 _FARTHEST = 20.0
-"""If a camera is farther from the base, its position is not in metres; in metres."""
+"""The distance of a camera from the base, in metres, above which its position is probably not in
+metres."""
 _POSITIONS = ("position", "translation")
 _ROTATIONS = ("orientation", "quaternion_xyzw", "rotation", "rpy_deg", "rvec")
 _MOST_ENVELOPES = 4
 _ENVELOPE = ("header", "child_frame_id", "covariance")
-"""The other keys of ROS messages that contain a pose."""
+"""Other keys of ROS messages that contain a pose."""
 
 
 def pose_of_value(value: Any, where: str) -> FoundPose:
-    """A pose from 4 x 4 numbers, or a mapping with a position and a rotation.
+    """Reads a pose from 4 x 4 numbers, or from a mapping with a position and a rotation.
 
     Raises:
-        UserError: it is not a rigid pose in metres; names the field.
+        UserError: the value is not a rigid pose in metres. The message names the field.
     """
     if isinstance(value, dict) and "data" not in value:
         return _pose_of_parts(value, where)
@@ -40,7 +41,7 @@ def pose_of_value(value: Any, where: str) -> FoundPose:
 
 def _pose_of_parts(value: dict[str, Any], where: str) -> FoundPose:
     parent, child = "", ""
-    # geometry_msgs nests Pose in PoseStamped and PoseWithCovariance.
+    # A message of geometry_msgs nests Pose in PoseStamped and PoseWithCovariance.
     for _ in range(_MOST_ENVELOPES):
         inner = next((key for key in ("pose", "transform") if key in value), None)
         if inner is None:
@@ -79,15 +80,16 @@ def _rotation(key: str, value: Any, where: str) -> Array:
 
 
 def rotation_of_rpy(degrees: Array) -> Rotation:
-    """Roll, pitch and yaw about the fixed axes x, y and z, in this order, as in ROS."""
+    """Returns the rotation by roll, pitch and yaw about the fixed axes x, y and z, in this
+    order."""
     return Rotation.from_euler("xyz", degrees, degrees=True)
 
 
 def rotation_of_quaternion(xyzw: Array, where: str, tolerance: float = _ORTHOGONAL) -> Array:
-    """(3, 3), from a unit quaternion.
+    """Returns the rotation matrix (3, 3) of a unit quaternion.
 
     Raises:
-        UserError: its length is not 1.
+        UserError: the length of the quaternion is not 1.
     """
     if abs(np.linalg.norm(xyzw) - 1) > tolerance:
         raise UserError(f"{where} must be a unit quaternion x, y, z, w")
@@ -95,17 +97,17 @@ def rotation_of_quaternion(xyzw: Array, where: str, tolerance: float = _ORTHOGON
 
 
 def assembled(R: Array, position: Array) -> Array:
-    """(4, 4), from a rotation and a position."""
+    """Returns the pose (4, 4) with a rotation (3, 3) and a position (3,)."""
     X = np.eye(4)
     X[:3, :3], X[:3, 3] = R, position
     return X
 
 
 def rigid(X: Array, where: str) -> Array:
-    """The same pose (4, 4), after checks.
+    """Returns the same pose (4, 4) after checks.
 
     Raises:
-        UserError: its rotation is not orthonormal, or it is not in metres.
+        UserError: the rotation is not orthonormal, or the position is not in metres.
     """
     R = X[:3, :3]
     if np.abs(R.T @ R - np.eye(3)).max() > _ORTHOGONAL or np.linalg.det(R) < 0:
@@ -116,5 +118,5 @@ def rigid(X: Array, where: str) -> Array:
         raise UserError(f"{where}: the last row of a pose must be 0 0 0 1{hint}")
     if np.linalg.norm(X[:3, 3]) > _FARTHEST:
         far = math.ceil(np.linalg.norm(X[:3, 3]))
-        raise UserError(f"{where}: the camera is {far} m from the base: positions are in metres")
+        raise UserError(f"{where}: the camera is {far} m from the base: give positions in metres")
     return X

@@ -1,4 +1,4 @@
-"""The pose of a camera in the robot's base frame, from the fields of its entry."""
+"""Reads the pose of a camera in the robot's base frame, from the fields of the camera's entry."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ from kitting_drake.real_camera.calibrations.yaml_values import matrix
 Array = NDArray[np.float64]
 
 _OPENCV = {"R_cam2base": "t_cam2base", "R_cam2gripper": "t_cam2gripper"}
-"""The rotations and translations that cv2.calibrateHandEye returns."""
+"""The rotations that cv2.calibrateHandEye returns, and their translations."""
 _STATED = ("camera_to_base", "base_to_camera", "camera_to_hand")
-"""Fields whose names say what the pose is of."""
+"""The fields whose names state which pose they hold."""
 _POSES = ("camera_to_base", "pose", "transform", "base_to_camera", "camera_to_hand")
 POSE_FIELDS = (
     *(*_OPENCV, *_OPENCV.values(), *_POSES),
     *("hand_to_base", "optical_to_link", "base_frame", "camera_frame"),
 )
-"""The fields of a camera's pose."""
+"""All fields of a camera's pose."""
 
 
 def has_pose(node: dict[str, Any]) -> bool:
@@ -43,16 +43,17 @@ def has_pose(node: dict[str, Any]) -> bool:
 
 
 def read_pose(node: dict[str, Any], where: str, folder: Path) -> Array:
-    """(4, 4): the pose of the camera's optical frame in the base frame, in any of the layouts.
+    """Returns the pose (4, 4) of the camera's optical frame in the base frame, in any of the
+    layouts.
 
     Args:
         node: the camera's entry.
-        where: the beginning of errors.
+        where: the beginning of error messages.
         folder: the folder of the files that the entry names.
 
     Raises:
         UserError: there is not exactly one pose, its rotation is invalid, or the camera is on the
-            hand and the hand's pose is missing; names the field.
+            hand and the hand's pose is missing. The message names the field.
     """
     found = _given_pose(node, where, folder)
     if "optical_to_link" in node:
@@ -84,17 +85,17 @@ def read_pose(node: dict[str, Any], where: str, folder: Path) -> Array:
 
 
 def _given_pose(node: dict[str, Any], where: str, folder: Path) -> FoundPose:
-    """The only pose in a camera's entry."""
+    """Returns the only pose in a camera's entry."""
     given = [key for key in (*_OPENCV, *_POSES) if key in node]
     for turn, position in _OPENCV.items():
         if position in node and turn not in node:
             given.insert(0, position)
     if len(given) > 1:
-        raise UserError(f"{where} has {' and '.join(given)}: give one pose")
+        raise UserError(f"{where} has {' and '.join(given)}: give only one pose")
     if not given:
         raise UserError(
             f"{where} has no pose: give camera_to_base (4 x 4), or pose with position and "
-            "quaternion_xyzw or rpy_deg, or a file of one"
+            "quaternion_xyzw or rpy_deg, or a file with a pose"
         )
     key = given[0]
     for turn, position in _OPENCV.items():
@@ -108,19 +109,19 @@ def _given_pose(node: dict[str, Any], where: str, folder: Path) -> FoundPose:
 
 
 def _as_stated(key: str, found: FoundPose, names: FrameNames) -> FoundPose:
-    """The pose of the camera, by the name of its field and of its frames."""
+    """Returns the pose of the camera, according to the names of its field and its frames."""
     turned = directed(found, names)
     if key not in _STATED:
         return turned
     if not turned.parent:
         turned = found.inverse if key == "base_to_camera" else found
         return FoundPose(turned.X, found.where, in_hand=key == "camera_to_hand")
-    # An inversion means that the file has the pose of the base in the camera.
+    # If the names require an inversion, the file has the pose of the base in the camera.
     is_inverse = turned.parent != found.parent
     if bool(turned.in_hand) != (key == "camera_to_hand") or is_inverse != (key == "base_to_camera"):
         raise UserError(
             f"{found.where} is the pose of {found.child} in {found.parent}, which is not {key}: "
-            "call it pose"
+            "rename the field to pose"
         )
     return turned
 
@@ -131,7 +132,7 @@ def _read_value(value: Any, where: str, folder: Path, names: FrameNames) -> Foun
     poses = read_pose_file(folder / value)
     if len(poses) == 1:
         return poses[0]
-    # Of several static transforms only that of the camera is meant.
+    # Of several static transforms, use that of the camera.
     ends = [
         pose
         for pose in poses
@@ -151,7 +152,7 @@ def _one_pose(value: Any, where: str, folder: Path) -> FoundPose:
 
 
 def _hand_pose(node: dict[str, Any], camera: FoundPose, where: str, folder: Path) -> Array:
-    """(4, 4): of the hand in the base."""
+    """Returns the pose (4, 4) of the hand in the base."""
     hand = _one_pose(node["hand_to_base"], f"{where}: hand_to_base", folder)
     if not hand.parent or not hand.child:
         return hand.X
@@ -164,7 +165,7 @@ def _hand_pose(node: dict[str, Any], camera: FoundPose, where: str, folder: Path
         return hand.inverse.X
     if kinds != [BASE, HAND]:
         raise UserError(
-            f"{hand.where} is the pose of {hand.child} in {hand.parent}, which is not that of the "
+            f"{hand.where} is the pose of {hand.child} in {hand.parent}; give the pose of the "
             f"hand {camera.parent} in the base"
         )
     if camera.parent and camera.parent.strip("/") not in (
@@ -172,7 +173,7 @@ def _hand_pose(node: dict[str, Any], camera: FoundPose, where: str, folder: Path
         hand.child.strip("/"),
     ):
         raise UserError(
-            f"{hand.where} is the pose of {hand.child}, but the camera's is given in "
-            f"{camera.parent}: give that of {camera.parent}"
+            f"{hand.where} is the pose of {hand.child}, but the camera's pose is in "
+            f"{camera.parent}: give the pose of {camera.parent}"
         )
     return hand.X

@@ -1,4 +1,5 @@
-"""Poses in calls of ROS's static_transform_publisher, such as MoveIt's hand-eye calibration."""
+"""Reads poses in calls of ROS's static_transform_publisher, such as MoveIt's hand-eye
+calibration."""
 
 from __future__ import annotations
 
@@ -28,7 +29,7 @@ _EXECUTABLES = ("executable", "node_executable")
 
 
 def published_poses(text: str, path: Path) -> list[FoundPose]:
-    """The poses that a file publishes: a launch file in XML or Python, or lines of a shell.
+    """Returns the poses that a file publishes: a launch file in XML or Python, or shell commands.
 
     Raises:
         UserError: the file is damaged, or the arguments of a publisher are not numbers and frames.
@@ -98,7 +99,8 @@ def _pose(words: Sequence[str], where: str) -> FoundPose:
     words = [word for word in words if ":=" not in word]
     if any(word.startswith("--") for word in words):
         return _pose_of_flags(words, where)
-    # The older layout: x y z yaw pitch roll, or x y z qx qy qz qw; then both frames, and a period.
+    # The older layout has x y z yaw pitch roll, or x y z qx qy qz qw; then both frames, and a
+    # period.
     values: list[float] = []
     while len(values) < len(words) and _is_number(words[len(values)]):
         values.append(float(words[len(values)]))
@@ -137,7 +139,7 @@ def _pose_of_flags(words: Sequence[str], where: str) -> FoundPose:
     angles = [values[key] for key in ("roll", "pitch", "yaw")]
     if any(f"--q{axis}" in given for axis in "xyzw"):
         if any(angles):
-            raise UserError(f"{where} has a quaternion and roll, pitch, yaw: give one of them")
+            raise UserError(f"{where} has both a quaternion and roll, pitch, yaw: give one of them")
         R = rotation_of_quaternion(np.array(quaternion), f"{where}: --qx --qy --qz --qw")
     else:
         R = np.asarray(rotation_of_rpy(np.degrees(angles)).as_matrix(), dtype=float)

@@ -1,4 +1,4 @@
-"""Which part of the workspace is table: polygons in the base frame, and an image of its pixels."""
+"""Says which part of the workspace is the table: polygons in the base frame, and an image mask."""
 
 from __future__ import annotations
 
@@ -21,33 +21,36 @@ from kitting_drake.real_camera.calibrations.yaml_values import number
 from systems.signals import PixelGrid
 
 Polygon = tuple[tuple[float, float], ...]
-"""Corners (x, y) in the base frame, in metres."""
+"""The corners (x, y) of a polygon in the base frame, in metres."""
 
 OUTLINE_FIELDS = ("region", "ignore", "region_mask")
 _INLINE = "data:image/png;base64,"
-"""How an image begins that the YAML itself contains, as `write_calibration` writes it."""
+"""The beginning of an image that is contained in the YAML, as `write_calibration` writes it."""
 _NOT_AN_IMAGE = (OSError, SyntaxError, ValueError, TypeError, Image.DecompressionBombError)
 
 
 @dataclass(frozen=True)
 class TableOutline:
-    """Which areas are table and which are not, such as the robot's base, profiles or the floor."""
+    """The areas that are table, and the areas that are not, such as the robot's base or the
+    floor."""
 
     region: Polygon = ()
-    """The table is only inside this polygon; empty for everywhere."""
+    """A polygon around the table. Empty: the table is everywhere."""
     ignore: tuple[Polygon, ...] = ()
-    """The areas inside these polygons are not table."""
+    """Polygons in which there is no table."""
     mask: tuple[bytes, ...] = ()
-    """A byte for each pixel of each row of the workspace, 1 for table; empty for everywhere."""
+    """A byte for each pixel of each row of the workspace, 1 for table. Empty: the table is
+    everywhere."""
 
     def inside(self, grid: PixelGrid) -> NDArray[np.bool_] | None:
-        """(rows, cols): the pixels whose centres are on the table; None if nothing is outlined.
+        """Returns the pixels (rows, cols) whose centres are on the table, or None without an
+        outline.
 
         Args:
             grid: the pixels of the workspace.
 
         Raises:
-            UserError: an outline misses the workspace, or nothing is left of it.
+            UserError: an outline misses the workspace, or no pixel is left.
         """
         if not (self.region or self.ignore or self.mask):
             return None
@@ -61,12 +64,14 @@ class TableOutline:
         for count, polygon in enumerate(self.ignore):
             inside &= ~_covered(polygon, xy, grid, f"ignore[{count}]")
         if not inside.any():
-            raise UserError("region, ignore and region_mask leave nothing of the workspace")
+            raise UserError(
+                "region, ignore and region_mask together leave no pixel of the workspace"
+            )
         inside.flags.writeable = False
         return inside
 
     def record(self) -> dict[str, Any]:
-        """The outline as fields of a calibration; without those that are not given."""
+        """Returns the outline as fields of a calibration, without those that are not given."""
         content: dict[str, Any] = {}
         if self.region:
             content["region"] = [list(corner) for corner in self.region]
@@ -80,12 +85,13 @@ class TableOutline:
         return content
 
     def mask_digest(self) -> str:
-        """A digest of the mask's pixels, which unlike a PNG does not depend on libraries."""
+        """Returns a digest of the mask's pixels, which unlike a PNG does not depend on
+        libraries."""
         return hashlib.sha256(b"\n".join(self.mask)).hexdigest()[:16]
 
 
 def inside_polygon(xy: NDArray[np.float64], polygon: Sequence[Sequence[float]]) -> NDArray[Any]:
-    """(...): whether points (..., 2) lie inside a polygon, by the even-odd rule."""
+    """Whether points (..., 2) lie inside a polygon, by the even-odd rule (...)."""
     x, y = xy[..., 0], xy[..., 1]
     inside = np.zeros(x.shape, bool)
     for (x0, y0), (x1, y1) in zip(polygon, [*polygon[1:], polygon[0]], strict=True):
@@ -97,7 +103,7 @@ def inside_polygon(xy: NDArray[np.float64], polygon: Sequence[Sequence[float]]) 
 
 
 def read_outline(node: dict[str, Any], path: Path, grid: PixelGrid) -> TableOutline:
-    """Reads the outline in a calibration.
+    """Reads the outline of the table in a calibration.
 
     Args:
         node: the calibration's fields.
@@ -105,7 +111,8 @@ def read_outline(node: dict[str, Any], path: Path, grid: PixelGrid) -> TableOutl
         grid: the pixels of the workspace.
 
     Raises:
-        UserError: a field is invalid, or misses the workspace; names the file and the field.
+        UserError: a field is invalid, or its polygon misses the workspace. The message names the
+            file and the field.
     """
     region: Polygon = ()
     ignore: tuple[Polygon, ...] = ()
@@ -143,7 +150,11 @@ def _read_polygon(value: Any, where: str) -> Polygon:
 
 
 def _read_mask(value: Any, path: Path, grid: PixelGrid) -> tuple[bytes, ...]:
-    """A row of bytes for each row of the workspace, from a file or an image in the YAML."""
+    """Reads a mask from a file, or from an image in the YAML.
+
+    Returns:
+        One string of bytes for each row of the workspace.
+    """
     if not isinstance(value, str):
         raise UserError(f"{path}: region_mask must be the name of an image, not {value!r}")
     inline = value.startswith(_INLINE)
@@ -160,8 +171,8 @@ def _read_mask(value: Any, path: Path, grid: PixelGrid) -> tuple[bytes, ...]:
         raise UserError(f"{path}: region_mask: cannot read {where}: {reason}") from error
     if white.shape != grid.shape:
         raise UserError(
-            f"{path}: region_mask: {where} has {white.shape[0]} rows and {white.shape[1]} columns, "
-            f"but the workspace has {grid.rows} rows and {grid.cols} cols"
+            f"{path}: region_mask: {where} has {white.shape[0]} rows and {white.shape[1]} "
+            f"columns, but the workspace has {grid.rows} rows and {grid.cols} columns"
         )
     return tuple(row.astype(np.uint8).tobytes() for row in white)
 
@@ -171,7 +182,7 @@ def _unpacked(mask: Sequence[bytes], grid: PixelGrid) -> NDArray[np.bool_]:
     if found.shape != grid.shape:
         raise UserError(
             f"region_mask has {found.shape[0]} rows and {found.shape[1]} columns, but the "
-            f"workspace has {grid.rows} rows and {grid.cols} cols"
+            f"workspace has {grid.rows} rows and {grid.cols} columns"
         )
     return found
 
@@ -179,7 +190,7 @@ def _unpacked(mask: Sequence[bytes], grid: PixelGrid) -> NDArray[np.bool_]:
 def _covered(
     polygon: Polygon, xy: NDArray[np.float64], grid: PixelGrid, what: str
 ) -> NDArray[np.bool_]:
-    """(rows, cols): the pixels inside a polygon; raises UserError if there is none."""
+    """Returns the pixels (rows, cols) inside a polygon; raises UserError if there are none."""
     covered = inside_polygon(xy, polygon)
     if covered.any():
         return np.asarray(covered)

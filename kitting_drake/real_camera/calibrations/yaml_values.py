@@ -1,4 +1,4 @@
-"""Reads YAML and JSON as OpenCV, ROS and people write it, and numbers from it."""
+"""Reads YAML and JSON files by OpenCV, ROS or people, and numbers from their values."""
 
 from __future__ import annotations
 
@@ -16,10 +16,11 @@ Array = NDArray[np.float64]
 
 
 class _Loader(yaml.SafeLoader):
-    """Plain YAML with `cv2.FileStorage` matrices; repeated fields are errors."""
+    """A loader of YAML with `cv2.FileStorage` matrices, for which repeated fields are errors."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        """The mapping. PyYAML itself would silently take the last of repeated fields."""
+        """Returns the mapping of a node; PyYAML itself would silently keep the last of repeated
+        fields."""
         pairs = node.value if isinstance(node, yaml.MappingNode) else []
         fields = [key.value for key, _ in pairs if isinstance(key, yaml.ScalarNode)]
         repeated = next((name for name in fields if fields.count(name) > 1), None)
@@ -38,7 +39,7 @@ _Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _opencv_matrix)
 
 
 def read_text(path: Path) -> str:
-    """The text of a file.
+    """Returns the text of a file.
 
     Raises:
         UserError: the file is unreadable or is not text.
@@ -46,13 +47,13 @@ def read_text(path: Path) -> str:
     try:
         return path.read_text(encoding="utf-8-sig")
     except (OSError, ValueError) as error:
-        # ValueError: the content is not text, or the path has a NUL.
+        # A ValueError means that the content is not text, or that the path has a NUL character.
         reason = getattr(error, "strerror", None) or "it is not text"
         raise UserError(f"cannot read {path}: {reason}") from error
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """The mapping in a YAML or JSON file; the first one of several documents.
+    """Returns the mapping in a YAML or JSON file; that of the first document if there are several.
 
     Raises:
         UserError: the file is unreadable or does not hold a mapping.
@@ -61,16 +62,17 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 
 def parse_yaml(text: str, path: Path) -> dict[str, Any]:
-    """The mapping in the text of a YAML or JSON file; the first one of several documents.
+    """Returns the mapping in a YAML or JSON text; that of the first document if there are several.
 
     Raises:
-        UserError: the text does not hold a mapping; names the file.
+        UserError: the text does not hold a mapping. The message names the file.
     """
     if text.startswith("%YAML:"):
-        # The first line that cv2.FileStorage writes is not a valid YAML directive.
+        # Remove the first line that cv2.FileStorage writes, because it is not a valid YAML
+        # directive.
         text = text.partition("\n")[2]
     if path.suffix == ".json" or text.lstrip().startswith("{"):
-        # YAML forbids tabs, which JSON may have.
+        # Replace tabs, which JSON allows and YAML forbids.
         text = text.replace("\t", " ")
     try:
         first = next(iter(yaml.load_all(text, _Loader)), None)
@@ -80,7 +82,7 @@ def parse_yaml(text: str, path: Path) -> dict[str, Any]:
         problem = getattr(error, "problem", None) or "it is not YAML"
         raise UserError(f"{path}:{where} {problem}") from error
     except (ValueError, KeyError, AttributeError) as error:
-        # Text that resembles a date, or a tag that does not fit its value.
+        # Such errors come from text that resembles a date, or a tag that does not fit its value.
         raise UserError(f"{path} is not YAML: {error}") from error
     except RecursionError as error:
         raise UserError(f"{path} is nested too deeply") from error
@@ -90,10 +92,10 @@ def parse_yaml(text: str, path: Path) -> dict[str, Any]:
 
 
 def number(value: Any, where: str) -> float:
-    """A finite number.
+    """Returns a value as a finite number.
 
     Raises:
-        UserError: the value is something else; names the field.
+        UserError: the value is something else. The message names the field.
     """
     try:
         # YAML 1.1 reads 4e2 as text.
@@ -106,10 +108,10 @@ def number(value: Any, where: str) -> float:
 
 
 def whole_number(value: Any, where: str) -> int:
-    """A whole number of 1 or more.
+    """Returns a value as a whole number of 1 or more.
 
     Raises:
-        UserError: the value is something else; names the field.
+        UserError: the value is something else. The message names the field.
     """
     result = number(value, where)
     if result < 1 or result != int(result):
@@ -118,11 +120,13 @@ def whole_number(value: Any, where: str) -> int:
 
 
 def numbers(value: Any, where: str) -> Array:
-    """A flat array of finite numbers from a list, a list of lists, a matrix of OpenCV or ROS
-    (`rows`, `cols`, `data`), or a mapping with x, y, z and possibly w.
+    """Returns a value as a flat array of finite numbers.
+
+    The value may be a list, a list of lists, a matrix of OpenCV or ROS (`rows`, `cols`, `data`), or
+    a mapping with x, y, z and possibly w.
 
     Raises:
-        UserError: the value is something else; names the field.
+        UserError: the value is something else. The message names the field.
     """
     if isinstance(value, dict) and "data" in value:
         value = value["data"]
@@ -135,10 +139,10 @@ def numbers(value: Any, where: str) -> Array:
 
 
 def matrix(value: Any, rows: int, cols: int, where: str) -> Array:
-    """`numbers` with the shape (rows, cols).
+    """Returns a value as an array of finite numbers with the shape (rows, cols); see `numbers`.
 
     Raises:
-        UserError: their count is wrong.
+        UserError: the number of numbers is wrong.
     """
     flat = numbers(value, where)
     if flat.size != rows * cols:

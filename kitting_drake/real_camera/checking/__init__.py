@@ -1,1 +1,1 @@
-"""Checks of real cameras by an empty table or a block of known size."""
+"""Checks of real cameras against an empty table, or a block of known size."""

@@ -1,4 +1,4 @@
-"""Finds errors of cameras by looking at an empty table or at a block of known size on it."""
+"""Finds errors of cameras from their views of an empty table, or of a block of known size on it."""
 
 from __future__ import annotations
 
@@ -30,25 +30,25 @@ Array = NDArray[np.float64]
 
 _LEAST_POINTS = 500
 _SHARED = 100
-"""Two cameras are compared only if they share at least this many pixels of o_t."""
+"""The least number of pixels of o_t that two cameras must share to be compared."""
 
 
 @dataclass(frozen=True)
 class TableCheck:
-    """The table as one or all cameras see it: its plane, noise and holes."""
+    """The plane, noise and holes of the table, as one or all cameras see it."""
 
     tilt: Array
-    """(2,): the apparent rotation of the table about base x and y, in radians."""
+    """The apparent rotation (2,) of the table about base x and y, in radians."""
     bias: float
-    """How much too high the table appears at the workspace's centre, in metres."""
+    """The apparent height of the table at the workspace's centre, minus the true one, in metres."""
     noise: float
-    """A robust standard deviation of the heights, in metres."""
+    """A robust estimate of the standard deviation of the heights, in metres."""
     holes: float
-    """The share of the table in view without depth."""
+    """The share of the table in view that has no depth."""
 
     @property
     def tilt_angle(self) -> float:
-        """The size of the rotation, in radians."""
+        """The size of the tilt, in radians."""
         return float(np.linalg.norm(self.tilt))
 
 
@@ -58,11 +58,12 @@ class CameraCheck:
 
     table: TableCheck
     distance: float
-    """From the camera to the centre of the seen part of the table, in metres."""
+    """The distance from the camera to the centre of the visible part of the table, in metres."""
     depth_bias: float
-    """The constant depth error that explains the heights if the pose is right, in metres."""
+    """The constant depth error that would explain the heights if the pose were right, in metres."""
     depth_bias_noise: float
-    """A robust standard deviation of the heights after subtracting that error, in metres."""
+    """A robust estimate of the standard deviation of the heights after subtracting that error, in
+    metres."""
     block: SeenBlock | None
 
 
@@ -72,16 +73,17 @@ class Check:
 
     cameras: dict[str, CameraCheck]
     together: TableCheck
-    """The check of o_t, which takes the highest point in each pixel."""
+    """The check of o_t, which contains the highest point in each pixel."""
     disagreements: dict[tuple[str, str], float]
-    """How much higher the first of two cameras sees the table, in metres."""
+    """For each pair of cameras, how much higher the first sees the table, in metres."""
     block_shifts: dict[tuple[str, str], Array]
-    """(2,): the block's position in the first of two cameras minus that in the second, in metres.
-    """
+    """For each pair of cameras, the block's position (2,) in the first minus that in the second, in
+    metres."""
     block: Block | None
     corrected: Calibration
     heights: dict[str, NDArray[np.float32]]
-    """(rows, cols) above the table for each camera, and for o_t as ''; NaN where unseen."""
+    """The heights (rows, cols) above the table, by camera name, and for o_t under the name ""; NaN
+    where unseen."""
 
 
 def check_cameras(
@@ -89,12 +91,13 @@ def check_cameras(
 ) -> Check:
     """Checks cameras by the table, which should be level and at its height in the base frame.
 
-    Each camera's pose is corrected by a rotation that makes the table level, and then by a lift.
-    With a block, the cameras are also shifted and rotated about the vertical to agree on its pose:
-    the given one, or else the mean of what they see.
+    Each camera's pose is corrected by a rotation that makes the table level, and then by a vertical
+    shift. With a block, the cameras are also shifted horizontally and rotated about the vertical,
+    so that they agree on the block's pose. That is the given pose, or else the mean of the poses
+    they see.
 
     Args:
-        frames: each camera's frame by its name, with nothing but the block on the table.
+        frames: a frame of each camera, by camera name, with nothing but the block on the table.
         calibration: the cameras' calibration.
         block: the block on the table, if any.
 
@@ -146,16 +149,16 @@ def check_cameras(
 
 
 def _is_verified(block: Block | None) -> bool:
-    """Whether the cameras now see a block where it is known to be."""
+    """Whether the cameras have seen a block at a known pose."""
     return block is not None and block.pose is not None
 
 
 def levelled(X_BC: Array, plane: Plane, grid: PixelGrid) -> Array:
-    """(4, 4): a camera's pose, corrected so that the plane that it sees becomes the table."""
+    """Corrects a camera's pose (4, 4) so that the plane that it sees becomes the table."""
     R = plane.levelling()
     corrected = X_BC.copy()
     corrected[:3, :3] = R @ X_BC[:3, :3]
-    # A point of the plane, after the rotation about the camera.
+    # The height of the plane below the camera after the rotation, which is about the camera.
     point = np.array([*X_BC[:2, 3], float(plane.height(X_BC[:2, 3]))])
     height = (R @ (point - X_BC[:3, 3]) + X_BC[:3, 3])[2]
     corrected[2, 3] += grid.z_min - height
@@ -163,7 +166,7 @@ def levelled(X_BC: Array, plane: Plane, grid: PixelGrid) -> Array:
 
 
 def middle_of(grid: PixelGrid) -> Array:
-    """(2,): the centre of the workspace in the base frame, in metres."""
+    """Returns the centre (2,) of the workspace in the base frame, in metres."""
     return np.array([(grid.x_min + grid.x_max) / 2, (grid.y_min + grid.y_max) / 2])
 
 
@@ -212,7 +215,8 @@ def _check_camera(
 
 
 def _height_map(points: Array, grid: PixelGrid) -> NDArray[np.float32]:
-    """(rows, cols): the mean height of a camera's points above the table; NaN where unseen."""
+    """Returns the mean height (rows, cols) of a camera's points above the table; NaN where
+    unseen."""
     seen = points[np.isfinite(points[..., 2])]
     row, col = np.rint(grid.to_pixel(seen[:, :2])).astype(int).T
     inside = (row >= 0) & (row < grid.rows) & (col >= 0) & (col < grid.cols)
@@ -246,7 +250,7 @@ def _disagreements(maps: Mapping[str, NDArray[np.float32]]) -> dict[tuple[str, s
 def _aligned(
     poses: Mapping[str, Array], seen: Mapping[str, SeenBlock], block: Block
 ) -> dict[str, Array]:
-    """The poses, shifted and rotated about the vertical to agree on the block's pose."""
+    """Shifts poses and rotates them about the vertical, so that they agree on the block's pose."""
     period = block.period
     if block.pose is None:
         first = next(iter(seen.values())).yaw

@@ -17,41 +17,45 @@ Array = NDArray[np.float64]
 
 _LEAST_PIXELS = 400
 _CLEAN = 0.0005
-"""Heights with more noise than this are filtered, in metres."""
+"""The noise of heights, in metres, above which they are filtered."""
 _LEAST_BAND = 0.001
-"""Points within this distance of the top's height belong to the top, in metres. If three times the
-noise is more, that counts instead."""
+"""The least distance from the top's height within which points belong to the top, in metres. Three
+times the noise is used if it is larger."""
 
 
 @dataclass(frozen=True)
 class Block:
-    """A block, as measured with a ruler."""
+    """A block with dimensions that were measured with a ruler."""
 
     size: tuple[float, float, float]
-    """Length, width and height, in metres."""
+    """The length, width and height, in metres."""
     pose: tuple[float, float, float] | None = None
-    """x, y of its centre in the base frame, in metres, and the yaw of its length, in radians."""
+    """The x and y of the block's centre in the base frame, in metres, and the yaw of its length, in
+    radians; None if unknown."""
 
     @property
     def period(self) -> float:
-        """The rotation under which it looks the same, in radians: a quarter turn if length and
-        width are nearly equal, otherwise a half turn."""
+        """The rotation under which the block looks the same, in radians.
+
+        It is a quarter turn if length and width are nearly equal, and a half turn otherwise.
+        """
         length, width, _ = self.size
         return math.pi / 2 if math.isclose(length, width, rel_tol=0.05) else math.pi
 
 
 @dataclass(frozen=True)
 class SeenBlock:
-    """A block as one camera sees it."""
+    """A block as seen by one camera."""
 
     middle: Array
-    """(2,): its centre in the base frame, in metres."""
+    """The position (2,) of the block's centre in the base frame, in metres."""
     yaw: float
     """The direction of the length about z, in radians, modulo `Block.period`."""
     size: tuple[float, float, float]
-    """Length, width and height, in metres."""
+    """The length, width and height, in metres."""
     corner: float
-    """The angle between its sides, in radians; a right angle for a correct camera."""
+    """The angle between the block's sides, in radians; a right angle if the calibration is
+    correct."""
 
 
 def see_block(
@@ -59,18 +63,20 @@ def see_block(
 ) -> SeenBlock:
     """Measures the block in a camera's image.
 
-    Depth only selects the pixels of the top. Their rays are intersected with the plane of the top.
-    The moments of the areas that the pixels cover there give the centre, direction and sides
-    without bias. Pixels near the top count as the top, and some of them may be of a visible wall.
-    They add a strip, whose width is computed and subtracted. Recesses inside the outline do not
-    matter, but notches in the outline do.
+    Depth serves only to select the pixels of the block's top. Their rays are intersected with the
+    plane of the top, and each pixel covers an area on it. The moments of these areas give the
+    centre, the direction and the sides of the top without bias.
+
+    Pixels near the top's height count as its top, and some of them may show a side wall. They add a
+    strip, whose width is computed and subtracted. Recesses inside the outline do not matter, but
+    notches in the outline do.
 
     Args:
-        points: (height, width, 3) in the base frame, as `table_points` gives them.
+        points: (height, width, 3) in the base frame, from `table_points`.
         camera: the camera.
-        X_BC: its pose.
+        X_BC: (4, 4) the camera's pose.
         block: the block to find.
-        table: height of the table, in metres.
+        table: the height of the table, in metres.
         noise: the standard deviation of the heights, in metres.
 
     Raises:
@@ -83,7 +89,7 @@ def see_block(
     if near.sum() < _LEAST_PIXELS:
         raise UserError(f"camera {camera.name} sees no block {1e3 * block.size[2]:g} mm high")
     values = z[near]
-    # Bins of a millimetre, with a margin in case all heights are equal.
+    # Use bins of a millimetre. The margin is for the case that all heights are equal.
     low, high = values.min() - 0.002, values.max() + 0.002
     counts, edges = np.histogram(values, math.ceil((high - low) / 0.001), (low, high))
     mode = edges[counts.argmax()] + (edges[1] - edges[0]) / 2
@@ -117,8 +123,10 @@ def see_block(
 
 
 def _filled(mask: NDArray[np.bool_], camera: BenchCamera) -> NDArray[np.bool_]:
-    """The largest part of a mask, with its holes filled. The convex hull would follow the outermost
-    points of a noisy outline."""
+    """Returns the largest part of a mask, with its holes filled.
+
+    The convex hull would instead follow the outermost points of a noisy outline.
+    """
     mask = ndimage.binary_fill_holes(ndimage.binary_closing(mask, iterations=2))
     mask = ndimage.binary_opening(mask, iterations=3)
     labels, count = ndimage.label(mask)
@@ -131,11 +139,15 @@ def _filled(mask: NDArray[np.bool_], camera: BenchCamera) -> NDArray[np.bool_]:
 
 
 def _on_plane(camera: BenchCamera, X_BC: Array, height: float) -> tuple[Array, Array]:
-    """The point in which each pixel's ray meets a horizontal plane, (height, width, 2) in metres;
-    and the area that the pixel covers there, (height, width), up to a factor."""
+    """Intersects each pixel's ray with a horizontal plane.
+
+    Returns:
+        The points (height, width, 2) in metres, and the areas (height, width) that the pixels cover
+        on the plane, up to a constant factor.
+    """
     u, v = (item.astype(float) for item in np.broadcast_arrays(camera.rays.u, camera.rays.v))
     directions = np.stack([u, v, np.ones_like(u)], axis=-1) @ X_BC[:3, :3].T
-    # The area of a pixel at depth 1, which varies only with distortion.
+    # The area of a pixel at depth 1 varies only with the distortion.
     (u_row, u_col), (v_row, v_col) = np.gradient(u), np.gradient(v)
     covered = np.abs(u_col * v_row - u_row * v_col)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -149,7 +161,7 @@ def _rotation(angle: float) -> Array:
 
 
 def _least_rectangle(points: Array) -> Array:
-    """(2, 2): the directions, as columns, of the smallest rectangle around points (n, 2)."""
+    """Returns the directions (2, 2), as columns, of the smallest rectangle around points (n, 2)."""
     corners = points[ConvexHull(points).vertices]
     edges = np.diff(corners, axis=0, append=corners[:1])
     candidates = [_rotation(angle) for angle in np.arctan2(edges[:, 1], edges[:, 0])]
@@ -157,15 +169,19 @@ def _least_rectangle(points: Array) -> Array:
 
 
 def _side_angles(local: Array) -> tuple[float, float]:
-    """How far a rectangle's sides are rotated from the axes, in radians, counter-clockwise: first
-    the sides along x, then those along y. Its outline (n, 2) is centred on the origin."""
+    """Returns by how much a rectangle's sides are rotated from the axes, counter-clockwise in
+    radians.
+
+    Its outline (n, 2) is centred on the origin. The first angle is that of the sides along x, the
+    second that of the sides along y.
+    """
     half = np.abs(local).max(axis=0)
     angles = []
     for along in (0, 1):
         across = 1 - along
         slopes = []
         for side in (-1, 1):
-            # Exclude the corners, which belong to two sides.
+            # Exclude the corners, because each belongs to two sides.
             own = (side * local[:, across] > half[across] - 0.2 * half.min()) & (
                 np.abs(local[:, along]) < 0.8 * half[along]
             )

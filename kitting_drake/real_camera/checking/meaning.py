@@ -1,4 +1,4 @@
-"""The report of a camera check: each number and its meaning for the clearance."""
+"""Explains the results of a camera check: each number, and its effect on a clearance of 2 mm."""
 
 from __future__ import annotations
 
@@ -12,31 +12,32 @@ from kitting_drake.real_camera.checking.kit_block import Block, SeenBlock
 from systems.pick_place_parameters import PickPlaceParameters
 
 CLEARANCE = 0.002
-"""The clearance between a tool and its recess, in metres."""
+"""The clearance between a tool and its cavity, in metres."""
 GOOD, TIGHT, BAD = "good", "tight", "too much"
 _HALF_KIT = 0.1
 """The distance from a kit's centre to its edge, in metres."""
 _OUT_OF_SCALE = 0.008
-"""Errors of the scale below this may be noise."""
+"""The error of the scale, as a share, below which it may be noise."""
 _HALF_WORKSPACE = 0.5
-"""In metres."""
+"""Half the length of the workspace, in metres."""
 _LEVEL = math.radians(0.02)
-"""A table with less tilt than this counts as level."""
+"""The tilt, in radians, below which a table counts as level."""
 _CLEAN, _NOISY = 0.0005, 0.0016
-"""Noise levels in metres. Heights with more than the first are filtered; with more than the second,
-details of 3 mm are lost (`policies/matching/segmentation.py`)."""
+"""Noise levels in metres: heights are filtered above the first, and details of 3 mm are lost above
+the second (see `policies/matching/segmentation.py`)."""
 _LOST = 1.8
-"""Details lower than this many times the noise are lost: two standard deviations of the filtered
-noise, which is nine tenths of the original one if neighbouring pixels are correlated."""
+"""The height below which details are lost, as a multiple of the noise. It is two standard
+deviations of the filtered noise, which is nine tenths of the original noise if neighbouring pixels
+are correlated."""
 _FEW_HOLES, _MANY_HOLES = 0.02, 0.10
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of a report."""
+    """One line of a check's report."""
 
     who: str
-    """A camera, a pair of cameras, or `together`."""
+    """The camera, the pair of cameras, or `together` for o_t."""
     what: str
     value: str
     verdict: str
@@ -44,11 +45,11 @@ class Finding:
 
 
 def findings(check: Check, planner: PickPlaceParameters | None = None) -> list[Finding]:
-    """All lines of a report, camera by camera.
+    """Returns all lines of a check's report, camera by camera.
 
     Args:
         check: the check of the cameras.
-        planner: how the robot picks and places; None for the cell's defaults.
+        planner: the parameters of the robot's motion; None for the simulated cell's defaults.
     """
     planner = PickPlaceParameters() if planner is None else planner
     lines: list[Finding] = []
@@ -75,7 +76,8 @@ def findings(check: Check, planner: PickPlaceParameters | None = None) -> list[F
                 "disagreement",
                 f"{1e3 * height:+.2f} mm",
                 _verdict(height),
-                "in height: an edge seen at a slant appears twice, about this far apart",
+                "difference in height: an edge that is seen obliquely appears twice, about this "
+                "far apart",
             )
         )
     for (one, other), shift in check.block_shifts.items():
@@ -85,7 +87,8 @@ def findings(check: Check, planner: PickPlaceParameters | None = None) -> list[F
                 "disagreement",
                 f"({1e3 * shift[0]:+.2f}, {1e3 * shift[1]:+.2f}) mm",
                 _verdict(float(np.linalg.norm(shift))),
-                "in the block's x and y: objects look wider by this, recesses narrower",
+                "difference in the block's x and y: objects look wider by this much, and "
+                "cavities narrower",
             )
         )
     return lines
@@ -111,13 +114,13 @@ def _of_table(
     else:
         about_x, about_y = np.degrees(table.tilt)
         tilted = (
-            f"{about_x:+.3f} about x and {about_y:+.3f} about y: with this rotation of the camera "
-            f"everything is displaced by {1e3 * aside:.1f} mm"
+            f"{about_x:+.3f} about x and {about_y:+.3f} about y: if the camera is rotated by this "
+            f"much, everything is displaced by {1e3 * aside:.1f} mm"
         )
     high = "high" if table.bias > 0 else "low"
     bias = f"grasps and rims look {1e3 * abs(table.bias):.1f} mm too {high}"
     if table.bias > floor:
-        # The hand stops this far above `table_height`, whatever the depths.
+        # The hand stops this far above `table_height`, whatever the cameras measure.
         into = f"{1e3 * (table.bias - floor):.1f} mm"
         bias += f"; if table_height is too low, fingertips may go {into} into the table"
     if table.noise <= _CLEAN:
@@ -143,7 +146,7 @@ def _of_table(
 
 def _of_block(who: str, seen: SeenBlock, block: Block) -> list[Finding]:
     length, width, height = scales(seen, block)
-    # Opposite errors of length and width must not cancel.
+    # Use absolute values, so that opposite errors of length and width do not cancel.
     worst = max(length, width, key=lambda share: abs(share - 1))
     wrong = (worst - 1) * _HALF_KIT
     reason = ""
@@ -177,21 +180,24 @@ def _of_block(who: str, seen: SeenBlock, block: Block) -> list[Finding]:
                 "offset",
                 f"({1e3 * x:+.2f}, {1e3 * y:+.2f}) mm, {math.degrees(yaw):+.2f} deg",
                 _verdict(math.hypot(x, y) + _HALF_KIT * abs(yaw)),
-                "picks and places are off by this, and by more with the distance from the block",
+                "picks and places are off by this much, and by more farther from the block",
             )
         )
     return lines
 
 
 def scales(seen: SeenBlock, block: Block) -> tuple[float, float, float]:
-    """The apparent length, width and height of a block, as shares of the true ones."""
+    """Returns the apparent length, width and height of a block, as shares of the true ones."""
     length, width, height = np.divide(seen.size, block.size).tolist()
     return length, width, height
 
 
 def offset(seen: SeenBlock, block: Block) -> tuple[float, float, float] | None:
-    """The apparent displacement of a block with known pose: x, y in metres and yaw in radians,
-    modulo `Block.period`. None without a known pose."""
+    """Returns the apparent displacement of a block whose pose is known.
+
+    It is x and y in metres and yaw in radians, modulo `Block.period`; None if the pose is not
+    known.
+    """
     if block.pose is None:
         return None
     x, y = seen.middle - np.array(block.pose[:2])
@@ -199,6 +205,6 @@ def offset(seen: SeenBlock, block: Block) -> tuple[float, float, float] | None:
 
 
 def _verdict(error: float) -> str:
-    """The verdict on an error in metres, by its share of the clearance."""
+    """Returns the verdict on an error in metres, by its share of the clearance."""
     share = abs(error) / CLEARANCE
     return GOOD if share < 0.25 else TIGHT if share < 0.75 else BAD

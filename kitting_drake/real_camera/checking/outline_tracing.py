@@ -1,4 +1,4 @@
-"""Traces the outline of a mask as a polygon with few corners."""
+"""Approximates the outline of a mask by a polygon with few corners."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _MOST = 12
-"""The most corners of a polygon."""
+"""The largest number of corners of a polygon."""
 _INSIDE = 0.010
-"""The polygon is this far inside the mask, in metres."""
+"""The distance in metres by which the polygon is inside the mask."""
 
 
 def disc(radius: float) -> Mask:
-    """(n, n): a disc for morphology; the radius is in cells."""
+    """Returns a disc (n, n) for morphology, with a given radius in cells."""
     reach = max(1, int(np.ceil(radius)))
     rows, cols = np.mgrid[-reach : reach + 1, -reach : reach + 1]
     return np.asarray(rows**2 + cols**2 <= max(radius, 1.0) ** 2)
 
 
 def largest_part(mask: Mask) -> Mask:
-    """The largest connected part of a mask (rows, cols), which must not be empty."""
+    """Returns the largest connected part of a mask (rows, cols); the mask must not be empty."""
     labels, found = ndimage.label(mask)
     if found <= 1:
         return mask
@@ -36,14 +36,15 @@ def largest_part(mask: Mask) -> Mask:
 
 
 def trace(mask: Mask, grid: PixelGrid) -> Polygon:
-    """The outline of a mask, slightly inside it, with at most 12 corners in the base frame.
+    """Returns the outline of a mask, slightly inside it, with at most 12 corners in the base frame.
 
     Args:
-        mask: (rows, cols), one connected part without holes. It must not touch the border.
-        grid: its cells.
+        mask: (rows, cols) one connected part without holes, which must not touch the border.
+        grid: the cells of the mask.
     """
     inner = ndimage.binary_erosion(mask, disc(_INSIDE / grid.resolution))
-    # Narrow spikes, such as between two objects at the table's edge, have no room for a tool.
+    # Remove narrow spikes, for instance between two objects at the table's edge: they have no room
+    # for a tool.
     smooth = ndimage.binary_opening(inner, disc(2 * _INSIDE / grid.resolution))
     for candidate in (smooth, inner, mask):
         if candidate.any():
@@ -55,7 +56,7 @@ def trace(mask: Mask, grid: PixelGrid) -> Polygon:
 
 
 def _border(mask: Mask) -> Array:
-    """(n, 2): the corners of the cells along the outer border, in order, as (row, col)."""
+    """Returns the corners (n, 2) of the cells along the outer border, in order, as (row, col)."""
     # Walk along the sides of cells with the mask on the right.
     padded = np.pad(mask, 1)
     row, col = np.argwhere(padded)[0]
@@ -72,12 +73,12 @@ def _border(mask: Mask) -> Array:
             ahead = (-ahead[1], ahead[0])
         elif not right:
             ahead = (ahead[1], -ahead[0])
-    # Undo the padding; corner (r, c) lies half a cell before the centre of cell (r, c).
+    # Subtract the padding. Corner (r, c) lies half a cell before the centre of cell (r, c).
     return np.array(corners, float) - 1.5
 
 
 def _cell_beside(mask: Mask, position: tuple[int, int], ahead: tuple[int, int], side: int) -> bool:
-    """Whether the cell ahead of a corner is in the mask, to the left (-1) or the right (1)."""
+    """Whether the cell ahead of a corner, to the left (-1) or to the right (1), is in the mask."""
     down, across = ahead
     # The right of a direction (down, across) is (across, -down), in rows and columns.
     right = (side * across, -side * down)
@@ -87,7 +88,7 @@ def _cell_beside(mask: Mask, position: tuple[int, int], ahead: tuple[int, int], 
 
 
 def _few(border: Array) -> Array:
-    """At most `_MOST` corners of a border (n, 2), by Douglas and Peucker."""
+    """Simplifies a border (n, 2) to at most `_MOST` corners, by the Douglas-Peucker algorithm."""
     first = int(np.hypot(*(border - border.mean(axis=0)).T).argmax())
     closed = np.roll(border, -first, axis=0)
     second = int(np.hypot(*(closed - closed[0]).T).argmax())
@@ -101,7 +102,7 @@ def _few(border: Array) -> Array:
 
 
 def _simplified(line: Array, tolerance: float) -> Array:
-    """The corners of a line (n, 2) from which it deviates by less than a tolerance."""
+    """Returns the corners of a line (n, 2) that approximate it within a tolerance."""
     kept = np.zeros(len(line), bool)
     kept[[0, -1]] = True
     spans = [(0, len(line) - 1)]

@@ -1,4 +1,4 @@
-"""Points in the base frame, and the plane through most of them."""
+"""Converts depth to points in the base frame, and fits planes to most of them."""
 
 from __future__ import annotations
 
@@ -15,58 +15,62 @@ from kitting_drake.real_camera.frames import Frame
 Array = NDArray[np.float64]
 
 FARTHEST = 0.15
-"""Points farther than this above or below the table are not part of it, in metres."""
+"""The largest distance of points above or below the table that may belong to it, in metres."""
 _TRIALS = 200
 _TRIED = 2000
-"""The number of points that score a trial."""
+"""The number of points on which a trial plane is scored."""
 _THIN = 1e-3
-"""Triples whose triangle, seen from above, has less than half this area, in square metres, are not
-tried."""
+"""The least half-area of a triangle of three points, as seen from above, in square metres; thinner
+triples are not tried."""
 _BAND = 0.004
-"""Points within this distance of a trial's plane are its inliers, in metres."""
+"""The largest distance of inliers from a trial plane, in metres."""
 _REFITS = 4
 _LEAST = 100
 """The least number of points of a plane."""
 _STEEP = 1.0
-"""The largest slope of a plane that may be a table in a wrong pose."""
+"""The largest slope of a plane that may be a table seen with a wrong pose."""
 
 
 @dataclass(frozen=True)
 class Plane:
-    """z = slope[0] x + slope[1] y + offset, in the base frame."""
+    """The plane z = slope[0] x + slope[1] y + offset in the base frame, in metres."""
 
     slope: Array
-    """(2,)."""
+    """The slope (2,) along x and y."""
     offset: float
     noise: float
-    """A robust standard deviation of its points, in metres."""
+    """A robust estimate of the standard deviation of the points' distance from the plane, in
+    metres."""
 
     def height(self, xy: Array) -> Array:
-        """(...): the heights at positions (..., 2), in metres."""
+        """Returns the heights (...) at positions (..., 2), in metres."""
         return np.asarray(xy @ self.slope + self.offset)
 
     @property
     def normal(self) -> Array:
-        """(3,): the upward unit normal."""
+        """The upward unit normal (3,)."""
         normal = np.array([-self.slope[0], -self.slope[1], 1.0])
         return normal / np.linalg.norm(normal)
 
     @property
     def tilt(self) -> Array:
-        """(2,): the rotation vector about base x and y from the base's xy plane to this plane, in
-        radians."""
+        """The rotation vector (2,) about base x and y, in radians, from the base's xy plane to this
+        one."""
         axis = np.cross([0.0, 0.0, 1.0], self.normal)
         sine = np.linalg.norm(axis)
         return axis[:2] * (math.asin(min(float(sine), 1.0)) / sine if sine > 0 else 0.0)
 
     def levelling(self) -> Array:
-        """(3, 3): the smallest rotation that makes it horizontal."""
+        """The smallest rotation (3, 3) that makes the plane horizontal."""
         return Rotation.from_rotvec([*-self.tilt, 0.0]).as_matrix()
 
 
 def table_points(frame: Frame, camera: BenchCamera, X_BC: Array, calibration: Calibration) -> Array:
-    """(height, width, 3): the point of each pixel in the base frame; NaN without depth, outside the
-    workspace's table, or far above or below it."""
+    """Returns the point (height, width, 3) of each pixel in the base frame.
+
+    It is NaN for pixels without depth, outside the workspace's table, or far above or below the
+    table.
+    """
     rays, depth = camera.rays, frame.depth
     with np.errstate(invalid="ignore"):
         good = np.isfinite(depth) & (depth >= rays.min_depth) & (depth <= rays.max_depth)
@@ -80,7 +84,7 @@ def table_points(frame: Frame, camera: BenchCamera, X_BC: Array, calibration: Ca
 
 
 def fit_plane(points: Array, steepest: float = 0.3) -> Plane:
-    """The plane through most points: RANSAC, refitted to its inliers.
+    """Fits a plane to most of the points by RANSAC, and refits it to its inliers.
 
     Args:
         points: (n, 3), at least a hundred.
@@ -109,11 +113,13 @@ def fit_plane(points: Array, steepest: float = 0.3) -> Plane:
 
 
 def find_planes(points: Array, most: int = 3) -> list[Plane]:
-    """The planes with most points, largest first. Points on a plane are ignored for the next ones.
+    """Finds the planes with most points, the largest first.
+
+    The points of a plane are ignored for the next ones.
 
     Args:
         points: (n, 3).
-        most: the number of planes.
+        most: the largest number of planes.
     """
     found = []
     left = points
@@ -127,11 +133,11 @@ def find_planes(points: Array, most: int = 3) -> list[Plane]:
 
 
 def refit(points: Array, plane: Array) -> Plane | None:
-    """A plane (slope along x, along y, offset), refitted to the points near it; None without any.
+    """Refits a plane to the points near it; returns None if there are none.
 
     Args:
         points: (n, 3).
-        plane: (3,), the plane to start from.
+        plane: (3,) the slope along x, the slope along y and the offset to start from.
     """
     design = np.column_stack([points[:, :2], np.ones(len(points))])
     noise = _BAND

@@ -1,4 +1,4 @@
-"""Decisions and checks as files and as terminal output."""
+"""Writes decisions and checks to files, and prints them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ CHECK_FILES = ("check.json", "corrected.yaml", "check.png")
 FOUND_FILES = ("found.yaml", "found.png")
 """The files that `save_found` writes."""
 _WELL_SEEN = 0.9
-"""A smaller seen share of the workspace in view is reported."""
+"""The visible share of the workspace in view below which the user is told."""
 
 
 def print_decision(console: Console, record: dict[str, Any]) -> None:
@@ -42,8 +42,8 @@ def print_decision(console: Console, record: dict[str, Any]) -> None:
         )
     if record["seen"] < _WELL_SEEN:
         console.print(
-            f"  only {100 * record['seen']:.0f} % of what is in view is seen; the rest is filled "
-            "in from its neighbours",
+            f"  the cameras measure only {100 * record['seen']:.0f} % of the pixels in view; the "
+            "others are filled in from their neighbours",
             highlight=False,
         )
     for name in ("pick", "place"):
@@ -72,7 +72,7 @@ def save_check(folder: Path, check: Check) -> None:
 
 
 def check_record(check: Check) -> dict[str, Any]:
-    """A check as JSON, in mm, degrees and percent."""
+    """Returns a check as JSON values, in mm, degrees and percent."""
     cameras = {}
     for name, camera in check.cameras.items():
         record = {**_table(camera.table), "depth_bias_mm": _mm(camera.depth_bias)}
@@ -104,7 +104,7 @@ def check_record(check: Check) -> dict[str, Any]:
 
 
 def print_check(console: Console, check: Check) -> None:
-    """Prints the findings and their meaning for a clearance of 2 mm."""
+    """Prints the findings, and their effect on a clearance of 2 mm."""
     table = Table(box=None, pad_edge=False)
     for title in ("camera", "", "", "2 mm clearance", "meaning"):
         table.add_column(title, overflow="fold")
@@ -128,9 +128,9 @@ def save_found(folder: Path, found: FoundTable, observation: Observation) -> Non
     """Writes the proposed calibration `found.yaml`, and the picture `found.png`.
 
     Args:
-        folder: for the files.
+        folder: the folder for the files.
         found: the proposal.
-        observation: the heightmap over `found.around`.
+        observation: the heightmap over the grid `found.around`.
 
     Raises:
         UserError: a file cannot be written.
@@ -146,7 +146,7 @@ def save_found(folder: Path, found: FoundTable, observation: Observation) -> Non
 
 
 def print_found(console: Console, found: FoundTable) -> None:
-    """Prints the table, the workspace and the region, a line each."""
+    """Prints the table, the workspace and the region, each on a line."""
     grid, outline = found.calibration.grid, found.calibration.outline
     x, y = found.extent
     region = found.calibration.region
@@ -157,7 +157,9 @@ def print_found(console: Console, found: FoundTable) -> None:
         f"workspace  x {grid.x_min:.3f} to {grid.x_max:.3f}, y {grid.y_min:+.3f} to "
         f"{grid.y_max:+.3f} m, {grid.rows} x {grid.cols} pixels: {found.chosen}",
         f"region     {len(outline.region)} corners, {covered:.0f} % of the workspace"
-        + (f"; {len(outline.ignore)} tall things are ignored" if outline.ignore else ""),
+        + (
+            f"; {len(outline.ignore)} areas with tall objects are ignored" if outline.ignore else ""
+        ),
     ]
     for line in lines:
         console.print(line, highlight=False, markup=False, soft_wrap=True)

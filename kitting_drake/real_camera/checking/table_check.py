@@ -24,24 +24,25 @@ UNVERIFIED = (
     "a block (--check --kit_size_mm --kit_pose) or markers (--calibrate); either writes "
     "verified: true"
 )
-"""The warning of a calibration that was not verified."""
+"""The warning for a calibration that was not verified."""
 _REFUSED_OFF, _REFUSED_TILT = 0.010, math.radians(1.3)
-"""A table that is farther off, in metres, or tilted by more cannot be picked from."""
+"""The largest height error, in metres, and the largest tilt of a table from which picks are
+trusted."""
 _WARNED_OFF, _WARNED_TILT = 0.005, math.radians(0.65)
 _STEP = 4
-"""Only every fourth row and column of an image is used."""
+"""The step between the rows and columns of an image that are used."""
 _FARTHEST = 0.35
-"""Planes are sought within this distance of the table's height, in metres."""
+"""The distance from the table's height within which planes are searched, in metres."""
 _LEAST = 150
-"""The least number of these pixels on a plane."""
+"""The least number of used pixels on a plane."""
 _BELOW, _ABOVE = 0.5, 0.08
-"""The plane at the table's height is not the table if it has less than this share of the pixels of
-a plane below it, or above it. Large objects may hide most of a table."""
+"""The least number of pixels on the plane at the table's height, as a share of those on a plane
+below it, and of those on a plane above it. Large objects may hide most of a table."""
 _CURVED = 0.5
-"""The depths are distances from the camera if taking them as such reduces the table's noise to less
+"""The depths are distances from the camera if converting them reduces the table's noise to less
 than this share."""
 _FLAT = 0.002
-"""A table with less noise than this is flat, in metres."""
+"""The noise below which a table counts as flat, in metres."""
 
 
 @dataclass(frozen=True)
@@ -49,26 +50,27 @@ class TableFit:
     """The table as a camera sees it."""
 
     off: float
-    """How much higher than expected it is at the middle of its seen part, in metres."""
+    """The measured height at the middle of the table's visible part, minus the expected one, in
+    metres."""
     tilt: float
-    """Its angle with the base's xy plane, in radians."""
+    """The table's angle with the base's xy plane, in radians."""
     plane: Plane
     support: int
-    """The number of pixels on it, of every fourth row and column."""
+    """The number of used pixels on the table."""
 
     @property
     def is_refused(self) -> bool:
-        """Whether no pick can be trusted."""
+        """Whether the table is so far off that no pick can be trusted."""
         return abs(self.off) > _REFUSED_OFF or self.tilt > _REFUSED_TILT
 
     @property
     def is_doubtful(self) -> bool:
-        """Whether a warning is due."""
+        """Whether the table is far enough off for a warning."""
         return abs(self.off) > _WARNED_OFF or self.tilt > _WARNED_TILT
 
 
 def check_table(frames: Mapping[str, Frame], calibration: Calibration) -> list[str]:
-    """Checks that every camera sees the table at its height, and level.
+    """Checks that every camera sees the table level and at its height.
 
     Args:
         frames: each camera's frame by its name, checked by `check_frame`.
@@ -78,8 +80,9 @@ def check_table(frames: Mapping[str, Frame], calibration: Calibration) -> list[s
         Warnings, a sentence each.
 
     Raises:
-        CalibrationError: a camera sees the table more than 10 mm off, or tilted by more than 1.3
-            degrees, or sees no table. The error says what would agree.
+        CalibrationError: a camera sees no table, or sees it more than 10 mm off or tilted by more
+            than 1.3 degrees. The message says which change of the calibration would agree with the
+            frame.
     """
     warnings = [] if calibration.verified else [UNVERIFIED]
     for camera in calibration.cameras:
@@ -115,7 +118,7 @@ def _said(fit: TableFit | None, grid: PixelGrid) -> str:
 def _fit(
     camera: BenchCamera, X_BC: Array, depth: NDArray[np.float32], calibration: Calibration
 ) -> TableFit | None:
-    """The plane that is most probably the table; None if there is none."""
+    """Returns the plane that is most probably the table; None if there is none."""
     grid = calibration.grid
     points = _points(camera, X_BC, depth, calibration)
     expected = refit(points, np.array([0.0, 0.0, grid.z_min]))
@@ -145,7 +148,7 @@ def _measured(plane: Plane, points: Array, grid: PixelGrid) -> TableFit:
 def _points(
     camera: BenchCamera, X_BC: Array, depth: NDArray[np.float32], calibration: Calibration
 ) -> Array:
-    """(n, 3): points in the base frame above or below the workspace's table, not far from it."""
+    """Returns points (n, 3) in the base frame that are close to the workspace's table."""
     rays = camera.rays
     u, v = (item[::_STEP, ::_STEP] for item in np.broadcast_arrays(rays.u, rays.v))
     z = depth[::_STEP, ::_STEP].astype(float)
@@ -162,7 +165,8 @@ def _points(
 def _is_range(
     camera: BenchCamera, depth: NDArray[np.float32], calibration: Calibration, fit: TableFit
 ) -> bool:
-    """Whether the table is flat only if depths are taken for distances from the camera."""
+    """Whether the depths seem to be distances from the camera: only if they are read so, the table
+    is flat."""
     if fit.plane.noise < _FLAT / 4:
         return False
     points = _points(camera, camera.X_BC, _as_depth(camera, depth), calibration)
@@ -173,7 +177,7 @@ def _is_range(
 
 
 def _as_depth(camera: BenchCamera, distance: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Converts distances from the camera to depths along the optical axis."""
+    """Converts distances from the camera (height, width) to depths along the optical axis."""
     rays = camera.rays
     return (distance / np.sqrt(1 + rays.u**2 + rays.v**2)).astype(np.float32)
 
@@ -181,7 +185,7 @@ def _as_depth(camera: BenchCamera, distance: NDArray[np.float32]) -> NDArray[np.
 def _hint(
     camera: BenchCamera, depth: NDArray[np.float32], calibration: Calibration, fit: TableFit | None
 ) -> str:
-    """A hint for the user: which change of the calibration would agree with the frame."""
+    """Returns a hint for the user: which change of the calibration would agree with the frame."""
     for text, other, X_BC, image in _suppositions(camera, depth):
         found = _fit(other, X_BC, image, calibration)
         if found is not None and not found.is_doubtful:
@@ -194,15 +198,15 @@ def _hint(
     about_x, about_y = np.degrees(fit.plane.tilt)
     return (
         f"the rotation of the pose is wrong by {about_x:.1f} degrees about base x and "
-        f"{about_y:.1f} about base y, or the image is rotated or of other intrinsics; --check on "
-        "an empty table writes a corrected calibration"
+        f"{about_y:.1f} about base y, or the image is rotated or belongs to other intrinsics; "
+        "--check on an empty table writes a corrected calibration"
     )
 
 
 def _suppositions(
     camera: BenchCamera, depth: NDArray[np.float32]
 ) -> Iterator[tuple[str, BenchCamera, Array, NDArray[np.float32]]]:
-    """Frequent mistakes: what to say, and the camera, pose and depth without the mistake."""
+    """Yields frequent mistakes: a hint, and the camera, pose and depth without the mistake."""
     X = camera.X_BC
     yield (
         "these depths are distances from the camera: give depths along the optical axis",

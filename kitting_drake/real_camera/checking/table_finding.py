@@ -1,4 +1,4 @@
-"""Proposes the table's height, the workspace and the region of interest from one frame."""
+"""Proposes the table's height, the workspace and the region of interest from one set of frames."""
 
 from __future__ import annotations
 
@@ -27,55 +27,61 @@ Mask = NDArray[np.bool_]
 _RESOLUTION = 0.003125
 """The side of o_t's pixels, in metres. Networks are trained with this size."""
 _CELL = 2 * _RESOLUTION
-"""Side of a cell in which the table's extent is found, in metres."""
+"""The side of the cells in which the table's extent is found, in metres."""
 _SIDES = (160, 320)
-"""The most rows and cols of a proposed workspace: 0.5 x 1.0 m."""
+"""The largest numbers of rows and columns of a proposed workspace, for 0.5 x 1.0 m."""
 _MULTIPLE = 16
-"""Rows and cols are multiples of this."""
+"""The number of which rows and columns are multiples."""
 _TILTED = math.radians(10)
-"""A plane that is tilted by more than this is no table, even with a slightly wrong pose."""
+"""The largest tilt, in radians, of a plane that may be a table seen with a slightly wrong pose."""
 MOST_TILT = math.radians(1.3)
-"""`decide` refuses a table that is tilted by more."""
+"""The largest tilt of a table, in radians, that `decide` accepts."""
 _STEP = 2
-"""Only every second row and column of an image is used."""
+"""The step between the rows and columns of an image that are used."""
 _REACH = 2.0
-"""The table is sought within this distance of the robot's base, along x and y, in metres."""
+"""The largest distance of the table from the robot's base along x and y, in metres."""
 _LEAST_SHARE = 0.1
-"""The least share of the points that must lie on the table, and ..."""
+"""The least share of the points that must lie on the table."""
 _LEAST_POINTS = 500
-"""... the least number of points."""
+"""The least number of points that must lie on the table."""
 _ABOVE_FLOOR = 0.25
-"""A level plane this far above the largest is a table above the floor, in metres, ..."""
+"""The least height above the largest level plane, in metres, at which another level plane is a
+table and the largest one is the floor."""
 _TABLE_SHARE = 0.1
-"""... if it has this share of the largest's points."""
+"""The least number of points of such a table, as a share of the points of the largest plane."""
 _BAND = 0.006
-"""Points this near to the plane lie on it, in metres, or within three times the noise."""
+"""The largest distance of points of the plane from it, in metres. Three times the noise is used if
+it is larger."""
 _LOW, _TALL = 0.12, 1.2
-"""Things lower than the first, in metres, are objects on the table. Taller things, such as the
-robot, are not part of it. Points above the second are ignored."""
+"""Two heights above the table, in metres. Anything lower than the first is an object on the table;
+anything between the two, such as the robot, is not part of the table; points above the second are
+ignored."""
 _CLOSED = 0.035
-"""Gaps in the table (from objects and shadows) narrower than twice this are closed, in metres."""
+"""Half the width, in metres, of the gaps in the table that are closed. They come from objects and
+shadows."""
 _KIT = 0.03
-"""An object at the table's edge is taken as part of the table if it is at least twice this wide, in
-metres; profiles along the edge are narrower."""
+"""Half the least width, in metres, of an object at the table's edge that counts as part of the
+table. Profiles along the edge are narrower."""
 _LEAST_TALL = 0.02
-"""Tall things thinner than this are noise, in metres."""
+"""The width below which tall things count as noise, in metres."""
 _AROUND = 0.02
-"""How far beyond tall things is ignored, in metres."""
+"""The margin around tall things that is ignored, in metres."""
 _TOO_NEAR = 0.25
-"""An arm cannot pick so near to the middle of its base, in metres."""
+"""The distance from the middle of an arm's base within which it cannot pick, in metres."""
 _ENOUGH = 0.6
-"""A workspace at that distance is chosen if it holds this share of the most table."""
+"""A workspace outside that distance is chosen if the table area in it is at least this share of the
+largest possible one."""
 _NEARLY = 0.97
-"""Workspaces that hold this share of the most table are equally good; the nearest is chosen."""
+"""Workspaces count as equally good if the table area in them is at least this share of the largest
+one. The nearest is chosen."""
 
 
 @dataclass(frozen=True)
 class FoundTable:
-    """A proposal."""
+    """A proposed calibration, and how it was found."""
 
     calibration: Calibration
-    """With table height, workspace and outline as found."""
+    """The calibration with the table height, workspace and outline that were found."""
     tilt: float
     """The table's angle with the base's xy plane, in radians."""
     share: float
@@ -83,14 +89,15 @@ class FoundTable:
     extent: tuple[float, float]
     """The size of the table in view along x and y, in metres."""
     chosen: str
-    """How the workspace was chosen, as part of a sentence."""
+    """How the workspace was chosen, as a part of a sentence."""
     around: PixelGrid
-    """A larger grid around the table in view, for a picture."""
+    """A larger grid around the visible table, for a picture."""
 
 
 def find_table(frames: Mapping[str, Frame], calibration: Calibration) -> FoundTable:
-    """Finds the table by the cameras' poses; height, workspace and outline of the calibration are
-    ignored.
+    """Finds the table in frames, using the cameras' poses.
+
+    The height, workspace and outline in the calibration are ignored.
 
     Args:
         frames: each camera's frame by its name. Kit and tools may stand on the table.
@@ -131,7 +138,7 @@ def find_table(frames: Mapping[str, Frame], calibration: Calibration) -> FoundTa
 
 
 def _points(frame: Frame, calibration: Calibration, number: int) -> Array:
-    """(n, 3): a camera's points in the base frame, not far from the base."""
+    """Returns a camera's points (n, 3) in the base frame, within `_REACH` of the base."""
     camera = calibration.cameras[number]
     u, v = (item[::_STEP, ::_STEP] for item in np.broadcast_arrays(camera.rays.u, camera.rays.v))
     z = frame.depth[::_STEP, ::_STEP].astype(float)
@@ -144,10 +151,10 @@ def _points(frame: Frame, calibration: Calibration, number: int) -> Array:
 
 
 def _table_plane(points: Array) -> tuple[Plane, float]:
-    """The table's plane and its share of the points."""
+    """Returns the table's plane, and the share of the points that lie on it."""
     no_plane = (
-        "no level plane is seen: show the table without much on it, and check the cameras' poses, "
-        "by which z of the base points up"
+        "no level plane is seen: remove most objects from the table, and check that z of the "
+        "base points up in the cameras' poses"
     )
     if len(points) < _LEAST_POINTS:
         raise UserError(no_plane)
@@ -172,7 +179,7 @@ def _table_plane(points: Array) -> tuple[Plane, float]:
 
 
 def _coarse_grid(points: Array, plane: Plane) -> PixelGrid:
-    """Cells over the points near the plane, with a margin of unseen cells."""
+    """Returns cells over the points near the plane, with a margin of unseen cells."""
     near = np.abs(points[:, 2] - plane.height(points[:, :2])) < max(_BAND, 3 * plane.noise)
     margin = 2 * _CLOSED
     low = np.floor((points[near, :2].min(axis=0) - margin) / _CELL) * _CELL
@@ -181,7 +188,8 @@ def _coarse_grid(points: Array, plane: Plane) -> PixelGrid:
 
 
 def _extent(points: Array, plane: Plane, grid: PixelGrid) -> tuple[Mask, Mask]:
-    """Two masks (rows, cols): the table with its objects, and things too tall to be objects."""
+    """Returns two masks (rows, cols): the table with its objects, and things too tall to be
+    objects."""
     above = points[:, 2] - plane.height(points[:, :2])
     cells = np.rint(grid.to_pixel(points[:, :2])).astype(int)
     inside = ((cells >= 0) & (cells < grid.shape)).all(axis=1)
@@ -193,7 +201,7 @@ def _extent(points: Array, plane: Plane, grid: PixelGrid) -> tuple[Mask, Mask]:
         found[cells[where, 0], cells[where, 1]] = True
         return found
 
-    # Neighbouring points of a camera may be more than a cell apart.
+    # Close gaps, because neighbouring points of a camera may be more than a cell apart.
     near = ndimage.binary_closing(holds(-band, band), disc(2))
     low = ndimage.binary_closing(holds(band, _LOW), disc(2))
     tall = ndimage.binary_opening(
@@ -203,7 +211,7 @@ def _extent(points: Array, plane: Plane, grid: PixelGrid) -> tuple[Mask, Mask]:
     table = ndimage.binary_closing(near | thick, disc(_cells(_CLOSED)))
     table = ndimage.binary_fill_holes(largest_part(table))
     labels, count = ndimage.label(ndimage.binary_dilation(tall, disc(_cells(_AROUND))))
-    # Only what stands on the table, or at its edge, is ignored.
+    # Ignore only the tall things that stand on the table or at its edge.
     on_table = np.isin(np.arange(count + 1), labels[table])
     on_table[0] = False
     return largest_part(table), np.asarray(on_table[labels])
@@ -214,7 +222,7 @@ def _cells(metres: float) -> float:
 
 
 def _ignored(tall: Mask, grid: PixelGrid, workspace: PixelGrid) -> tuple[Polygon, ...]:
-    """The hulls of tall things in the workspace, largest first."""
+    """Returns the hulls of tall things in the workspace, largest first."""
     labels, count = ndimage.label(tall)
     polygons = []
     for number in range(1, count + 1):
@@ -228,7 +236,7 @@ def _ignored(tall: Mask, grid: PixelGrid, workspace: PixelGrid) -> tuple[Polygon
 
 
 def _workspace(table: Mask, grid: PixelGrid) -> tuple[PixelGrid, str]:
-    """The proposed pixels of o_t, and how they were chosen."""
+    """Returns the proposed pixels of o_t, and how they were chosen."""
     low = grid.to_world(np.argwhere(table).min(axis=0)) - _CELL / 2
     high = grid.to_world(np.argwhere(table).max(axis=0)) + _CELL / 2
     step = _MULTIPLE * _RESOLUTION
@@ -240,8 +248,8 @@ def _workspace(table: Mask, grid: PixelGrid) -> tuple[PixelGrid, str]:
     else:
         centre = _best_centre(table, grid, shape * _RESOLUTION, centre, shape == needed)
         chosen = (
-            "of the table in view, which is larger, the part nearest to the robot's base, from "
-            f"{_TOO_NEAR:g} m on"
+            "the part of the visible table that is nearest to the robot's base, from "
+            f"{_TOO_NEAR:g} m on, because the table is larger"
         )
     corner = np.round((centre - shape * _RESOLUTION / 2) / _RESOLUTION) * _RESOLUTION
     x, y = (round(float(value), 6) for value in corner)
@@ -249,11 +257,11 @@ def _workspace(table: Mask, grid: PixelGrid) -> tuple[PixelGrid, str]:
 
 
 def _best_centre(table: Mask, grid: PixelGrid, size: Array, centre: Array, fits: Mask) -> Array:
-    """(2,): the centre of the best window, in metres.
+    """Returns the centre (2,) of the best window, in metres.
 
-    Of the windows that hold nearly the most table, it is the nearest to the base. Windows that are
-    too near the base count only if the others hold much less table. Along an axis on which the
-    whole table fits, the window is at `centre`.
+    Among the windows with nearly the largest table area, it is the nearest to the base. Windows
+    that are too near the base are chosen only if the others have much less table area. Along an
+    axis on which the whole table fits, the window's centre is `centre`.
     """
     window = np.rint(size / _CELL).astype(int)
     sums = np.pad(table.astype(np.int64).cumsum(0).cumsum(1), ((1, 0), (1, 0)))
@@ -275,7 +283,7 @@ def _best_centre(table: Mask, grid: PixelGrid, size: Array, centre: Array, fits:
     )
     i, j = (item.ravel() for item in np.indices(held.shape))
     corner = grid.to_world(np.column_stack([starts[0][i], starts[1][j]]) - 0.5)
-    # The distance of the base from the nearest point of each window.
+    # Compute the distance of the base from the nearest point of each window.
     beside = np.maximum(np.maximum(corner, -(corner + window * _CELL)), 0)
     apart = np.hypot(*beside.T) > _TOO_NEAR - 1e-6
     table_in = held.ravel()
@@ -288,7 +296,7 @@ def _best_centre(table: Mask, grid: PixelGrid, size: Array, centre: Array, fits:
 
 
 def _covering(grid: PixelGrid, table: Mask, workspace: PixelGrid) -> PixelGrid:
-    """Cells over the table in view and the workspace, with a margin."""
+    """Returns cells over the visible table and the workspace, with a margin."""
     xy = grid.to_world(np.argwhere(table))
     low = np.minimum(xy.min(axis=0), (workspace.x_min, workspace.y_min)) - 0.06
     high = np.maximum(xy.max(axis=0), (workspace.x_max, workspace.y_max)) + 0.06

@@ -17,24 +17,26 @@ from systems.signals import Observation, PixelGrid
 Array = NDArray[np.float64]
 
 _LEAST_SEEN = 0.01
-"""If a camera sees a smaller share of the workspace, its pose is wrong."""
+"""The least share of the workspace that a camera with a correct pose sees."""
 _LEAST_DEPTH = 0.01
-"""The least share of pixels towards the workspace with any depth."""
+"""The least share of pixels that have a depth, among those that look at the workspace."""
 _NEAREST, _FARTHEST = 0.8, 1.25
-"""Plausible median depths, as multiples of the table's; outside them the unit or pose is wrong."""
+"""The smallest and largest plausible median depth, as multiples of the table's depth. Beyond them
+the unit or the pose is wrong."""
 _STEP = 4
-"""Only every fourth pixel is checked."""
+"""The step between the pixels that are checked."""
 _OPTICAL = np.eye(4)
 _OPTICAL[:3, :3] = Rotation.from_euler("xyz", [-90, 0, -90], degrees=True).as_matrix()
-"""The optical frame in ROS's body frame of a camera (x forward, y left, z up)."""
+"""The pose (4, 4) of the optical frame in ROS's body frame of a camera (x forward, y left, z
+up)."""
 
 
 class CalibrationError(UserError):
-    """The cameras see something else than the calibration says."""
+    """Raised if the cameras' images contradict the calibration."""
 
 
 def check_frames(frames: Mapping[str, Frame], calibration: Calibration) -> dict[str, Frame]:
-    """The frames of all cameras, with contiguous arrays.
+    """Returns the frames of all cameras, with contiguous arrays.
 
     Args:
         frames: each camera's frame by its name.
@@ -56,7 +58,7 @@ def check_views(frames: Mapping[str, Frame], calibration: Calibration) -> None:
     """Checks that the cameras look at the workspace, and that their depths are in metres.
 
     Args:
-        frames: as `check_frames` returns them.
+        frames: the frames that `check_frames` returns.
         calibration: the cameras' calibration.
 
     Raises:
@@ -68,17 +70,17 @@ def check_views(frames: Mapping[str, Frame], calibration: Calibration) -> None:
 
 
 def observe(frames: Mapping[str, Frame], calibration: Calibration) -> Observation:
-    """o_t, with the same heightmap as in the simulated cell.
+    """Makes the observation o_t, with the same kind of heightmap as in the simulated cell.
 
     Args:
-        frames: as `check_frames` returns them.
+        frames: the frames that `check_frames` returns.
         calibration: the cameras' calibration.
     """
     return project(make_views(frames, calibration), calibration.grid, calibration.region)
 
 
 def make_views(frames: Mapping[str, Frame], calibration: Calibration) -> list[View]:
-    """The cameras' views; the arguments are those of `observe`."""
+    """Returns the cameras' views; the arguments are those of `observe`."""
     views = []
     for camera in calibration.cameras:
         frame = frames[camera.name]
@@ -89,9 +91,11 @@ def make_views(frames: Mapping[str, Frame], calibration: Calibration) -> list[Vi
 def table_depth(
     camera: BenchCamera, calibration: Calibration, step: int = 1
 ) -> NDArray[np.float64]:
-    """(height, width): the depth of the table by the camera's pose alone, for pixels that look at
-    the workspace's table, in metres; NaN elsewhere. Only every `step`th pixel along rows and
-    columns."""
+    """Returns the depth (height, width) of the table in metres, by the camera's pose alone.
+
+    It is NaN for pixels that do not look at the workspace's table. Only every `step`th row and
+    column is computed.
+    """
     X_BC, grid = camera.X_BC, calibration.grid
     rays = camera.rays
     u, v = (item[::step, ::step] for item in np.broadcast_arrays(rays.u, rays.v))
@@ -104,7 +108,7 @@ def table_depth(
 
 
 def seen_share(observation: Observation) -> float:
-    """The seen share of o_t's pixels in view of any camera, from 0 to 1."""
+    """Returns the measured share, from 0 to 1, of the pixels of o_t in view of any camera."""
     seen = observation.valid[observation.in_view]
     return float(seen.mean()) if seen.size else 0.0
 
@@ -112,8 +116,10 @@ def seen_share(observation: Observation) -> float:
 def _in_view(
     camera: BenchCamera, X_BC: Array, grid: PixelGrid, step: int = _STEP
 ) -> NDArray[np.bool_]:
-    """(n,): whether each of the workspace's pixels is in the image, at the table's height. Only
-    every `step`th pixel along rows and columns."""
+    """Whether each pixel (n,) of the workspace is in the camera's image, at the table's height.
+
+    Only every `step`th row and column is computed.
+    """
     rows, cols = np.meshgrid(
         np.arange(0, grid.rows, step), np.arange(0, grid.cols, step), indexing="ij"
     )
@@ -182,15 +188,21 @@ def _check_depth(frame: Frame, camera: BenchCamera, calibration: Calibration) ->
         return
     found = float(np.median(depth[returned]))
     told = (
-        f"depth of camera {camera.name} is {found:.3g} m, the median, where by its pose the table"
+        f"depth of camera {camera.name} has a median of {found:.3g} m, where by its pose the table"
     )
     told += f" is {found / ratio:.3g} m away"
     if 500 < ratio < 2000:
-        hint = "these are millimetres: a .npy file holds metres, and depth_scale is metres a step"
+        hint = (
+            "the depths seem to be millimetres: a .npy file must hold metres, and depth_scale "
+            "is metres per step"
+        )
     elif 1 / 2000 < ratio < 1 / 500 or found < 1.5 * camera.depth_scale:
-        hint = "these are metres: a 16-bit PNG holds steps of depth_scale, of 1 mm by default"
+        hint = (
+            "the depths seem to be metres: a 16-bit PNG must hold steps of depth_scale, which "
+            "is 1 mm by default"
+        )
     else:
-        return  # `check_table` tells more.
+        return  # `check_table` gives a better hint.
     raise CalibrationError(f"{told}: {hint}")
 
 

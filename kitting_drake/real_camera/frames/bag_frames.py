@@ -1,4 +1,4 @@
-"""The first synchronised images of colour and depth in a recording of ROS."""
+"""Finds the first synchronised images of colour and depth in a ROS recording."""
 
 from __future__ import annotations
 
@@ -28,23 +28,23 @@ from kitting_drake.real_camera.recordings.recording import (
 Images = tuple[NDArray[np.uint8], NDArray[np.float32]]
 
 _TOGETHER = 0.05
-"""Images farther apart in time than this do not form a frame, in seconds."""
+"""The largest difference in time between the images of a frame, in seconds."""
 _ALIGNED = re.compile(r"aligned_depth_to_color|depth_registered|depth_to_rgb|registered_depth")
 _COLOUR = re.compile(r"colou?r|rgb")
 _REALSENSE = re.compile(r"/device_\d+/sensor_\d+/")
 _DIFFERENT = 0.02
-"""If the intrinsics of the calibration and of a CameraInfo differ by more than this, as a share of
-the focal length or of the width, they are of two lenses."""
+"""The largest difference between the intrinsics of the calibration and a CameraInfo, as a share of
+the focal length or the width. If it is larger, they belong to two lenses."""
 _UNITS = "std_msgs/msg/Float32"
 
 
 def read_bag_frames(path: Path, calibration: Calibration, time: float | None) -> dict[str, Images]:
-    """Colour and depth of each camera from the same recording, by the cameras' names.
+    """Returns colour and depth of each camera from the same recording, by camera name.
 
     Args:
         path: the recording's path.
         calibration: the cameras' calibration.
-        time: how long after the start of the recording, in seconds; None for the first images.
+        time: the time after the start of the recording, in seconds; None for the first images.
 
     Raises:
         UserError: topics are missing or ambiguous, depth is not registered to colour, no images are
@@ -69,7 +69,7 @@ def read_bag_frames(path: Path, calibration: Calibration, time: float | None) ->
 
 
 def _topics(recording: Recording, camera: BenchCamera, alone: bool) -> tuple[str, str]:
-    """The topics of colour and of depth."""
+    """Returns the topics of colour and of depth."""
     if camera.topics is not None:
         for topic in camera.topics:
             if topic not in recording.kinds:
@@ -94,14 +94,14 @@ def _topics(recording: Recording, camera: BenchCamera, alone: bool) -> tuple[str
 
 
 def _uncompressed(topics: Sequence[str]) -> list[str]:
-    """The topics that are not compressed copies of others."""
+    """Returns the topics that are not compressed copies of others."""
     return [topic for topic in topics if topic.rpartition("/")[0] not in topics]
 
 
 def _first_pair(
     recording: Recording, topics: tuple[str, str], time: float | None
 ) -> tuple[RecordedMessage, RecordedMessage]:
-    """The colour image and the depth image of the first moment that has both."""
+    """Returns the colour image and the depth image of the first moment that has both."""
     colors: list[RecordedMessage] = []
     depths: list[RecordedMessage] = []
     for message in recording.messages(topics):
@@ -124,8 +124,10 @@ def _first_pair(
 def _settled(
     colors: list[RecordedMessage], depths: list[RecordedMessage], ended: bool
 ) -> tuple[RecordedMessage, RecordedMessage] | None:
-    """A pair, as soon as no later colour image can be nearer in time. Removes images that cannot
-    belong to any pair."""
+    """Returns a pair of images as soon as no later colour image can be closer in time.
+
+    It removes the images that cannot belong to any pair.
+    """
     while depths and colors:
         first = depths[0]
         if not ended and colors[-1].stamp < first.stamp:
@@ -159,7 +161,7 @@ def _check_registered(
 
 
 def _check_lenses(recording: Recording, topics: tuple[str, str], camera: BenchCamera) -> None:
-    """Compares the calibration with the CameraInfo beside the images, where there is one."""
+    """Compares the calibration with the CameraInfo of the images, if there is one."""
     lens = camera.intrinsics if camera.color is None else camera.color.intrinsics
     for topic, intrinsics in zip(topics, (lens, camera.intrinsics), strict=True):
         info = _sibling(recording, topic)
@@ -169,7 +171,7 @@ def _check_lenses(recording: Recording, topics: tuple[str, str], camera: BenchCa
 
 
 def _sibling(recording: Recording, topic: str) -> str | None:
-    """The topic of the CameraInfo that belongs to an image's topic."""
+    """Returns the topic of the CameraInfo that belongs to an image's topic."""
     parts, infos = topic.split("/"), recording.topics(CAMERA_INFO)
     for count in (1, 2):
         stem = "/".join(parts[:-count])
@@ -206,7 +208,7 @@ def _compare(message: RecordedMessage, lens: Intrinsics, camera: BenchCamera, pa
 
 
 def _check_scale(recording: Recording, topic: str, camera: BenchCamera) -> None:
-    """Compares depth_scale with the units that a RealSense recording has."""
+    """Compares depth_scale with the depth units that a RealSense recording contains."""
     found = _REALSENSE.match(topic)
     name = f"{found.group()}option/Depth_Units/value" if found else ""
     if name not in recording.topics(_UNITS):

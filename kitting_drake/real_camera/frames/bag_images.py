@@ -1,4 +1,4 @@
-"""Images from messages of ROS."""
+"""Converts ROS messages to images."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ _PNG = b"\x89PNG"
 
 
 def color_of_message(body: Any, where: str) -> NDArray[np.uint8]:
-    """(height, width, 3): red, green, blue, from an Image or a CompressedImage.
+    """Returns an image (height, width, 3) in red, green, blue, from an Image or a CompressedImage.
 
     Raises:
-        UserError: its encoding cannot be read; begins with `where`.
+        UserError: the encoding cannot be read. The message begins with `where`.
     """
     if hasattr(body, "format"):
         with _decoded(bytes(body.data), where) as image:
@@ -43,10 +43,10 @@ def color_of_message(body: Any, where: str) -> NDArray[np.uint8]:
 
 
 def depth_of_message(body: Any, where: str) -> NDArray[Any]:
-    """(height, width): floats in metres or whole steps, from an Image or a CompressedImage.
+    """Returns depth (height, width), as floats in metres or as whole steps.
 
     Raises:
-        UserError: its encoding cannot be read; begins with `where`.
+        UserError: the encoding cannot be read. The message begins with `where`.
     """
     if not hasattr(body, "format"):
         if body.encoding not in _DEPTHS:
@@ -56,8 +56,8 @@ def depth_of_message(body: Any, where: str) -> NDArray[Any]:
         return _pixels(body, np.dtype(_DEPTHS[body.encoding]), 1, where)[:, :, 0]
     data = bytes(body.data)
     if "32FC1" in body.format:
-        raise UserError(f"{where} has rounded floats: record the Image, not the compressed one")
-    # Compressed depth has a header of twelve bytes before the PNG.
+        raise UserError(f"{where} is compressed with rounded floats: record the Image instead")
+    # A compressed depth image has a header of twelve bytes before the PNG.
     start = data.find(_PNG, 0, 16)
     if start < 0:
         raise UserError(f"{where} is compressed as {body.format}: depth must be a PNG of 16UC1")
@@ -68,7 +68,7 @@ def depth_of_message(body: Any, where: str) -> NDArray[Any]:
 
 
 def _pixels(body: Any, kind: np.dtype[Any], channels: int, where: str) -> NDArray[Any]:
-    """(height, width, channels), from the bytes of an Image."""
+    """Returns the pixels (height, width, channels) in the bytes of an Image."""
     big = bool(body.is_bigendian)
     kind = kind.newbyteorder(">" if big else "<")
     height, width, step = int(body.height), int(body.width), int(body.step)

@@ -12,14 +12,14 @@ from kitting_drake.real_camera.frames.point_clouds import project_points
 def register_color(
     color: NDArray[np.uint8], depth: NDArray[np.float32], camera: BenchCamera
 ) -> NDArray[np.uint8]:
-    """(height, width, 3): the colour of each point that the depth camera sees.
+    """Returns the colour (height, width, 3) of each point that the depth camera sees.
 
-    Pixels without depth, and points out of the colour camera's sight, are black. A point that is
-    hidden from the colour camera gets the colour of what hides it.
+    Pixels without depth, and points outside the colour camera's view, are black. A point that is
+    hidden from the colour camera gets the colour of the surface that hides it.
 
     Args:
-        color: (height, width, 3), of the camera's colour lens.
-        depth: (height, width), in metres.
+        color: (height, width, 3) an image of the camera's colour lens.
+        depth: (height, width) in metres.
         camera: the camera. If it has no separate lens for colour, the image is returned unchanged.
 
     Raises:

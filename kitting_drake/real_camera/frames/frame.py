@@ -1,4 +1,4 @@
-"""The images of a camera at one time."""
+"""The images of a camera at one time, and checks of them."""
 
 from __future__ import annotations
 
@@ -17,13 +17,14 @@ class Frame:
     """The images of a camera at one time, with depth registered to colour."""
 
     color: NDArray[np.uint8]
-    """(height, width, 3): red, green, blue."""
+    """Colours (height, width, 3) in red, green, blue."""
     depth: NDArray[np.float32]
-    """(height, width) along the optical axis, in metres; 0, infinity and NaN mean no depth."""
+    """Depths (height, width) along the optical axis, in metres; 0, infinity and NaN mean no
+    depth."""
 
 
 def check_frame(frame: Frame, camera: BenchCamera) -> Frame:
-    """Checks the sizes and types of a frame that did not come from files.
+    """Checks the sizes and types of a frame that was not read from files.
 
     Raises:
         UserError: a size or type is wrong.
@@ -46,13 +47,13 @@ def check_frame(frame: Frame, camera: BenchCamera) -> Frame:
 def check_size(
     shape: tuple[int, ...], lens: Intrinsics, camera: BenchCamera, what: str, advice: str = ""
 ) -> None:
-    """Raises UserError if an image is not of the calibrated size.
+    """Raises UserError if an image does not have the calibrated size.
 
     Args:
         shape: (height, width, ...) of the image.
         lens: the image's lens.
-        camera: for the message.
-        what: the image, for the message.
+        camera: the camera, which the message names.
+        what: the name of the image in the message.
         advice: the end of the message.
     """
     width, height = lens.size

@@ -26,7 +26,7 @@ from kitting_drake.real_camera.frames.point_clouds import CLOUD_ENDINGS, read_cl
 from kitting_drake.real_camera.recordings.recording import is_recording
 
 _WHOLE_ENDINGS = (".npz", *CLOUD_ENDINGS)
-"""Files of colour and depth together."""
+"""The endings of files that hold colour and depth together."""
 _CONVERSIONS = {
     ".raw": "save it by numpy.save, as (height, width)",
     ".bin": "save it by numpy.save, as (height, width)",
@@ -44,25 +44,30 @@ _CONVERSIONS = {
     ".e57": "save it as .ply, with colours",
     ".las": "save it as .ply, with colours",
 }
-"""How to convert what is not read."""
+"""How to convert files that cannot be read, by ending."""
 
 _Sources = tuple[Path, ...]
-"""The files of a camera: colour and depth, or one that holds both."""
+"""The files of a camera: one for colour and one for depth, or one that holds both."""
 
 
 def read_frames(
     paths: Sequence[Path], calibration: Calibration, *, time: float | None = None
 ) -> dict[str, Frame]:
-    """The frames of all cameras, by name.
+    """Reads the frames of all cameras, by camera name.
+
+    `paths` may be:
+
+    - folders. For a camera NAME, one of them has `NAME_color.png` and `NAME_depth.png` (or other
+    endings), or `NAME.npz`, or a folder NAME with `color.png` and `depth.png`. For a single camera,
+    `color.png` and `depth.png` are enough.
+    - files in the order of the calibration's cameras: for each camera a colour and a depth image,
+    or one file that holds both.
+    - one recording.
 
     Args:
-        paths: folders, or files in the order of the calibration's cameras: a colour and a depth
-            image for each, or one file that holds both; or one recording. For a camera NAME, a
-            folder holds `NAME_color.png` and `NAME_depth.png` (or another ending), or `NAME.npz`,
-            or a folder NAME with `color.png` and `depth.png`. A single camera may also have just
-            `color.png` and `depth.png`.
+        paths: the folders, files or recording.
         calibration: the cameras' calibration.
-        time: in a recording, how long after its start, in seconds; None for its first images.
+        time: the time after the start of a recording, in seconds; None for its first images.
 
     Raises:
         UserError: a file is missing, unreadable, or not of the calibration's size.
@@ -73,7 +78,7 @@ def read_frames(
     recordings = [path for path in paths if is_recording(path)]
     if recordings:
         if len(paths) > 1:
-            raise UserError(f"{recordings[0]} is a recording: give it alone")
+            raise UserError(f"{recordings[0]} is a recording: give no other files with it")
         images = read_bag_frames(recordings[0], calibration, time)
         return {
             camera.name: _frame(*images[camera.name], camera, [str(recordings[0])] * 2)
@@ -97,10 +102,10 @@ def read_frames(
 
 
 def find_color(folders: Sequence[Path], name: str, alone: bool) -> Path:
-    """The colour image of a camera in folders.
+    """Returns the colour image of a camera in folders.
 
     Raises:
-        UserError: there is not exactly one.
+        UserError: there is no such image, or several.
     """
     return _only(_candidates(folders, name, alone, COLOUR_NAMES, COLOUR_ENDINGS), folders, name, 0)
 
@@ -114,9 +119,9 @@ def _read(sources: _Sources, camera: BenchCamera) -> Frame:
             seen, depth = read_cloud(path, camera)
             if seen is None:
                 raise UserError(
-                    f"{path} has no colours: save it with colours, or give a colour image beside it"
+                    f"{path} has no colours: save it with colours, or give a colour image with it"
                 )
-            # Its colours are those of its points.
+            # The colours of the cloud are those of its points.
             return Frame(seen, depth)
         return _frame(color, depth, camera, [str(path)] * 2)
     color_path, depth_path = sources
@@ -131,7 +136,7 @@ def _read(sources: _Sources, camera: BenchCamera) -> Frame:
 def _frame(
     color: NDArray[np.uint8], depth: NDArray[np.float32], camera: BenchCamera, named: Sequence[str]
 ) -> Frame:
-    """Checks sizes, and registers colour to depth."""
+    """Checks the sizes of colour and depth, and registers colour to depth."""
     if camera.color is None:
         advice = ": if colour has a lens of its own, describe it by color: in the calibration"
         check_size(color.shape, camera.intrinsics, camera, named[0], advice)
@@ -142,17 +147,19 @@ def _frame(
 
 
 def _grouped(files: Sequence[Path]) -> Iterator[_Sources]:
-    """The files of each camera: those that hold both, or pairs in either order."""
+    """Yields the files of each camera: single files that hold both, or pairs in either order."""
     for path in files:
         _check_ending(path)
     if files and all(path.suffix.lower() in _WHOLE_ENDINGS for path in files):
         yield from ((path,) for path in files)
         return
     if len(files) % 2:
-        raise UserError("frames that are files come in pairs: a colour image and a depth image")
+        raise UserError("frames in files must come in pairs: a colour image and a depth image")
     for first, second in zip(files[::2], files[1::2], strict=True):
         if ".npz" in (first.suffix.lower(), second.suffix.lower()):
-            raise UserError(f"{first} and {second}: an .npz file holds both: give it alone")
+            raise UserError(
+                f"{first} and {second}: an .npz file holds colour and depth: give it alone"
+            )
         depths = [
             path.suffix.lower() in CLOUD_ENDINGS or is_depth(path) for path in (first, second)
         ]
@@ -174,7 +181,8 @@ def _check_ending(path: Path) -> None:
 def _candidates(
     folders: Sequence[Path], name: str, alone: bool, words: Sequence[str], endings: Sequence[str]
 ) -> list[Path]:
-    """The existing files of a camera, with one of some words and endings."""
+    """Returns the existing files of a camera that have one of some words and endings in their
+    names."""
     stems = [f"{name}_", f"{name}/", *([""] if alone else [])]
     candidates = [
         folder / f"{stem}{word}{ending}"
@@ -187,7 +195,7 @@ def _candidates(
 
 
 def _find(folders: Sequence[Path], name: str, alone: bool) -> _Sources:
-    """The files of a camera in folders."""
+    """Returns the files of a camera in folders."""
     whole = [
         *_candidates(folders, name, alone, ("frame", "cloud"), _WHOLE_ENDINGS),
         *(
@@ -204,8 +212,8 @@ def _find(folders: Sequence[Path], name: str, alone: bool) -> _Sources:
     if whole:
         others = (*colors, *depths)
         raise UserError(
-            f"camera {name}: {', '.join(map(str, folders))} holds both {whole[0].name} and "
-            f"{others[0].name}: there must be one frame"
+            f"camera {name}: {', '.join(map(str, folders))} has both {whole[0].name} and "
+            f"{others[0].name}: keep one frame only"
         )
     if not depths:
         for path in _candidates(folders, name, alone, ("depth", "frame"), tuple(_CONVERSIONS)):
@@ -214,7 +222,7 @@ def _find(folders: Sequence[Path], name: str, alone: bool) -> _Sources:
 
 
 def _only(existing: Sequence[Path], folders: Sequence[Path], name: str, number: int) -> Path:
-    """The only file found; `number` is 0 for colour and 1 for depth."""
+    """Returns the only file found; `number` is 0 for colour and 1 for depth."""
     if len(existing) != 1:
         word, ending = (("color", ".png"), ("depth", ".npy"))[number]
         reason = (
@@ -223,5 +231,5 @@ def _only(existing: Sequence[Path], folders: Sequence[Path], name: str, number: 
             else f"neither {name}_{word}{ending} nor {name}/{word}{ending}"
         )
         places = ", ".join(map(str, folders))
-        raise UserError(f"camera {name}: {places} holds {reason}: there must be one image")
+        raise UserError(f"camera {name}: {places} has {reason}: there must be exactly one image")
     return existing[0]

@@ -1,4 +1,4 @@
-"""Colour and depth from images: PNG, JPEG, TIFF, EXR, and numpy's arrays."""
+"""Reads colour and depth from images (PNG, JPEG, TIFF, EXR) and from NumPy's arrays."""
 
 from __future__ import annotations
 
@@ -21,22 +21,23 @@ DEPTH_ENDINGS = (".npy", ".png", ".tif", ".tiff", ".exr")
 _ALWAYS_DEPTH = (".npy", ".exr")
 _DEPTH_MODES = ("I;16", "I;16B", "I", "F")
 _DAMAGED = (OSError, SyntaxError, ValueError)
-"""Pillow's exceptions for a damaged file; SyntaxError is for a PNG with a broken chunk."""
+"""Pillow's exceptions for a damaged file. SyntaxError is raised for a PNG with a broken chunk."""
 _NOT_AN_IMAGE = (*_DAMAGED, TypeError, KeyError, Image.DecompressionBombError)
 _NOT_NUMPY = (
     *(OSError, ValueError, EOFError, SyntaxError, TokenError, KeyError, TypeError),
     *(zipfile.BadZipFile, zlib.error, NotImplementedError, MemoryError),
 )
-"""Numpy's exceptions for a damaged file."""
+"""NumPy's exceptions for a damaged file."""
 _DEPTH_CHANNELS = ("z", "depth", "v", "y")
-"""The last parts of names of EXR's channels of depth; Blender writes Depth.V or Depth.Z."""
+"""The possible names of an EXR's depth channel, after the last dot. Blender writes Depth.V or
+Depth.Z."""
 
 
 def is_depth(path: Path) -> bool:
-    """Whether an image is of depth: of floats, or of more than 8 bits.
+    """Whether an image is of depth: floats, or more than 8 bits.
 
     Raises:
-        UserError: it is not an image.
+        UserError: the file is not an image.
     """
     if path.suffix.lower() in _ALWAYS_DEPTH:
         return True
@@ -45,10 +46,10 @@ def is_depth(path: Path) -> bool:
 
 
 def read_color(path: Path) -> NDArray[np.uint8]:
-    """(height, width, 3): red, green, blue.
+    """Reads the colours (height, width, 3) of an image: red, green, blue.
 
     Raises:
-        UserError: the file is damaged, or does not have 8 bits.
+        UserError: the file is damaged, or does not have 8 bits per channel.
     """
     with _open(path) as image:
         if image.mode in _DEPTH_MODES:
@@ -63,11 +64,11 @@ def read_color(path: Path) -> NDArray[np.uint8]:
 
 
 def read_depth(path: Path, depth_scale: float) -> NDArray[np.float32]:
-    """(height, width), in metres.
+    """Reads depths (height, width), in metres.
 
     Args:
         path: the file of the image or array.
-        depth_scale: metres per step of an image or array of whole numbers.
+        depth_scale: the metres per step of an image or array of whole numbers.
 
     Raises:
         UserError: the file is damaged, or does not hold depths.
@@ -86,14 +87,14 @@ def read_depth(path: Path, depth_scale: float) -> NDArray[np.float32]:
 
 
 def read_npz(path: Path, depth_scale: float) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """Colour and depth from an archive with arrays of these names.
+    """Reads colour and depth from an archive with arrays of these names.
 
     Raises:
-        UserError: one is missing, damaged, or of a wrong type.
+        UserError: an array is missing, damaged, or of a wrong type.
     """
     archive = _load(path)
     if isinstance(archive, np.ndarray):
-        raise UserError(f"{path} is a single array: call it .npy")
+        raise UserError(f"{path} is a single array: rename it to .npy")
     with archive:
         names = [name for name in COLOUR_NAMES if name in archive.files]
         if len(names) != 1 or "depth" not in archive.files:
@@ -113,7 +114,8 @@ def read_npz(path: Path, depth_scale: float) -> tuple[NDArray[np.uint8], NDArray
 
 
 def depth_of_array(data: NDArray[Any], depth_scale: float, what: str) -> NDArray[np.float32]:
-    """(height, width), in metres, from floats in metres or whole steps of `depth_scale`.
+    """Converts floats in metres, or whole steps of `depth_scale`, to depths (height, width) in
+    metres.
 
     Raises:
         UserError: the array has another shape or type.
@@ -166,7 +168,7 @@ def _read_depth_image(path: Path) -> NDArray[Any]:
 
 
 def _read_exr(path: Path) -> NDArray[Any]:
-    """The channel of depth."""
+    """Reads the depth channel of an EXR image."""
     purpose = "reading EXR images"
     openexr = import_extra("OpenEXR", purpose=purpose, extra="camera")
     if not path.is_file():
@@ -182,7 +184,7 @@ def _read_exr(path: Path) -> NDArray[Any]:
     if len(channels) == 1:
         named = list(channels)
     elif not named and {"R", "G", "B"} <= set(channels):
-        # Some programs write a grey image in three channels.
+        # Some programs write a grey image in three equal channels.
         equal = all(np.array_equal(channels["R"], channels[c], equal_nan=True) for c in "GB")
         named = ["R"] if equal else []
     if len(named) != 1:

@@ -1,4 +1,4 @@
-"""Reads point clouds in PCL's format: PCD, as text, binary, or compressed."""
+"""Reads point clouds in PCL's format PCD, as text, binary, or compressed."""
 
 from __future__ import annotations
 
@@ -15,12 +15,16 @@ _HEADER = ("FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "POINTS", "DATA
 _NEEDED = ("FIELDS", "SIZE", "TYPE", "WIDTH", "HEIGHT", "DATA")
 _UNMOVED = [0.0, 0, 0, 1, 0, 0, 0]
 _LONGEST = 100
-"""A header has fewer lines than this."""
+"""The number of lines that a header cannot exceed."""
 _KINDS = {"F": "f", "U": "u", "I": "i"}
 
 
 def read_pcd(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8] | None, tuple[int, int]]:
-    """The points (n, 3), their colours (n, 3) or None, and (width, height) of the organisation.
+    """Reads a point cloud.
+
+    Returns:
+        The points (n, 3), their colours (n, 3) or None, and the (width, height) in which they are
+        organised.
 
     Raises:
         UserError: the file is damaged, or its points are not in the camera's frame.
@@ -39,18 +43,18 @@ def read_pcd(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8] | None,
         raise UserError(f"{path} has no field {missing[0]}")
     if len(viewpoint) != 7 or not np.allclose(viewpoint, _UNMOVED):
         raise UserError(
-            f"{path} has another VIEWPOINT than 0 0 0 1 0 0 0: save the points in the frame of the "
-            "camera"
+            f"{path} has a VIEWPOINT other than 0 0 0 1 0 0 0: save the points in the frame of "
+            "the camera"
         )
     points = np.stack([table[axis] for axis in "xyz"], axis=-1).astype(float)
     packed = next((table[name] for name in ("rgb", "rgba") if name in table), None)
-    # Some programs lose all colours in text, where they become zero.
+    # Some programs write all colours as zero in text files; ignore such colours.
     colors = _unpacked(packed) if packed is not None and packed.any() else None
     return points, colors, (int(header["WIDTH"][0]), int(header["HEIGHT"][0]))
 
 
 def _read_header(content: bytes) -> tuple[dict[str, list[str]], int]:
-    """The header's words by key, and where the data begin."""
+    """Returns the header's words by key, and the position at which the data begin."""
     header: dict[str, list[str]] = {}
     at = 0
     for _ in range(_LONGEST):
@@ -67,7 +71,7 @@ def _read_header(content: bytes) -> tuple[dict[str, list[str]], int]:
 
 
 def _read_table(header: dict[str, list[str]], data: bytes) -> dict[str, NDArray[Any]]:
-    """The first number of each field, by its name."""
+    """Returns the first number of each field, by the field's name."""
     names = header["FIELDS"]
     counts = [int(word) for word in header.get("COUNT", ["1"] * len(names))]
     kinds = [
@@ -75,7 +79,7 @@ def _read_table(header: dict[str, list[str]], data: bytes) -> dict[str, NDArray[
         for kind, size in zip(header["TYPE"], header["SIZE"], strict=True)
     ]
     points = int(header["WIDTH"][0]) * int(header["HEIGHT"][0])
-    # Padding is called _, several times.
+    # Padding fields are all called _, so there may be several of this name.
     columns = [(f"{name}{i}" if name == "_" else name) for i, name in enumerate(names)]
     rows = np.dtype(
         [(name, kind, (n,)) for name, kind, n in zip(columns, kinds, counts, strict=True)]
@@ -97,7 +101,7 @@ def _read_table(header: dict[str, list[str]], data: bytes) -> dict[str, NDArray[
     if len(data) < 8 + packed or size != rows.itemsize * points:
         raise ValueError("the data are not complete")
     plain, at, result = _decompressed(data[8 : 8 + packed], size), 0, {}
-    # Compressed data have one field after another.
+    # In compressed data, all values of one field precede those of the next.
     for name, kind, n in zip(columns, kinds, counts, strict=True):
         result[name] = np.frombuffer(plain, kind, points * n, at).reshape(points, n)[:, 0]
         at += kind.itemsize * points * n
@@ -105,7 +109,7 @@ def _read_table(header: dict[str, list[str]], data: bytes) -> dict[str, NDArray[
 
 
 def _decompressed(data: bytes, size: int) -> bytes:
-    """The data before compression by LZF."""
+    """Decompresses data by LZF to a given size."""
     result, at = bytearray(), 0
     while at < len(data):
         control = data[at]
@@ -124,7 +128,7 @@ def _decompressed(data: bytes, size: int) -> bytes:
         if start < 0:
             raise ValueError("the data are damaged")
         while length > 0:
-            # The copied part may overlap its copy.
+            # The source of the copy may overlap its destination.
             piece = result[start : start + length]
             result += piece
             start, length = start + len(piece), length - len(piece)
@@ -134,7 +138,7 @@ def _decompressed(data: bytes, size: int) -> bytes:
 
 
 def _unpacked(packed: NDArray[Any]) -> NDArray[np.uint8]:
-    """(n, 3), from 0x00RRGGBB, which PCL also stores as the bits of a float."""
+    """Unpacks colours (n, 3) from 0x00RRGGBB, which PCL also stores as the bits of a float."""
     bits = packed.view(np.uint32) if packed.dtype.kind == "f" else packed.astype(np.uint32)
     shifted = np.stack([bits >> 16, bits >> 8, bits], axis=-1)
     return (shifted & 0xFF).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Colour and depth images from point clouds: PLY and PCD."""
+"""Makes colour and depth images from point clouds (PLY and PCD)."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ Array = NDArray[np.float64]
 
 CLOUD_ENDINGS = (".ply", ".pcd")
 _OFF = 2.0
-"""If the points of an organised cloud are off by more in the median, in pixels, the lens is another
-one."""
+"""The largest median distance, in pixels, between the points of an organised cloud and their
+pixels. If it is larger, the cloud belongs to another lens."""
 _METRES = 50.0
-"""If depths are larger, they are probably in millimetres; in metres."""
+"""The depth in metres above which depths are probably in millimetres."""
 
 
 def read_cloud(
     path: Path, camera: BenchCamera
 ) -> tuple[NDArray[np.uint8] | None, NDArray[np.float32]]:
-    """Colour (height, width, 3), None if the cloud has no colours, and depth (height, width).
+    """Reads a point cloud as images: colour (height, width, 3), or None, and depth (height, width).
 
-    The points are in the camera's optical frame (x right, y down, z forward), in metres. A cloud
-    with one point for each pixel, in rows, is taken as it is. The points of any other cloud are
-    projected through the camera's lens. In each pixel the nearest point counts.
+    The points must be in the camera's optical frame (x right, y down, z forward), in metres. If a
+    cloud has one point for each pixel, in rows, its points become the pixels. The points of any
+    other cloud are projected through the camera's lens; in each pixel the nearest point counts.
 
     Raises:
         UserError: the file is damaged, or its points are not in the camera's frame.
@@ -60,17 +60,17 @@ def read_cloud(
     middle = float(np.median(points[seen, 2]))
     if middle > _METRES:
         raise UserError(
-            f"{path} is {middle:.4g} m away, in the median: save its points in metres, not "
-            "millimetres"
+            f"{path} has points with a median distance of {middle:.4g} m: save them in metres, "
+            "not millimetres"
         )
     col, row = project_points(points[seen], camera.intrinsics)
     if len(points) == width * height:
         off = np.hypot(col - np.flatnonzero(seen) % width, row - np.flatnonzero(seen) // width)
         if np.median(off) > _OFF:
             raise UserError(
-                f"{path} has a point for each pixel, but they are {np.median(off):.0f} pixels from "
-                f"where camera {camera.name} would see them: check its intrinsics, and that the "
-                "cloud is in its optical frame"
+                f"{path} has a point for each pixel, but the points are {np.median(off):.0f} "
+                f"pixels from where camera {camera.name} would see them: check its intrinsics, "
+                "and that the cloud is in its optical frame"
             )
         depth = np.where(seen, points[:, 2], 0).reshape(height, width)
         image = None if colors is None else colors.reshape(height, width, 3)
@@ -79,7 +79,7 @@ def read_cloud(
 
 
 def project_points(points: Array, lens: Intrinsics) -> tuple[Array, Array]:
-    """Projects points (n, 3) in front of a lens to column and row, measured from pixel centres."""
+    """Projects points (n, 3) in front of a lens; returns columns and rows, from pixel centres."""
     x, y = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]
     if lens.distortion:
         x, y = distort(x, y, lens.model, lens.distortion)
@@ -99,7 +99,7 @@ def _rendered(
     if not inside.any():
         raise UserError(f"camera {camera.name} would see no point of its cloud: check its pose")
     cells = np.rint(row[inside]).astype(int), np.rint(col[inside]).astype(int)
-    # In each pixel the last assignment counts. It is that of the nearest point.
+    # In each pixel the last assignment counts, which is that of the nearest point.
     order = np.argsort(-points[inside, 2], kind="stable")
     cells = cells[0][order], cells[1][order]
     depth[cells] = points[inside, 2][order]

@@ -1,1 +1,1 @@
-"""Poses of cameras from a board of markers that lies on the table."""
+"""Finds poses of cameras from a board of markers that lies on the table."""

@@ -23,21 +23,22 @@ from kitting_drake.real_camera.markers.board_poses import BoardFit, fit_board
 from kitting_drake.real_camera.markers.boards import Board, SeenBoard, find_corners
 
 _MOVED = 0.5
-"""If all images together err by this much more than each alone, in pixels, something moved."""
+"""The largest difference between the error of all images together and that of single images, in
+pixels. If it is larger, the board or the camera moved."""
 
 
 @dataclass(frozen=True)
 class CalibratedCamera:
-    """A camera's images of the board, and what they tell."""
+    """A camera's images of the board, and the pose computed from them."""
 
     name: str
     image: NDArray[np.uint8]
-    """The first one, (height, width, 3)."""
+    """The first image (height, width, 3)."""
     seen: SeenBoard
     """The corners in the first image."""
     images: int
     corners: int
-    """In all images."""
+    """The number of corners in all images."""
     fit: BoardFit
 
 
@@ -48,21 +49,21 @@ class Calibrated:
     board: Board
     cameras: tuple[CalibratedCamera, ...]
     calibration: Calibration
-    """With the poses, and with the table's height by the board."""
+    """The calibration with the new poses, and with the table's height measured by the board."""
 
 
 def calibrate_cameras(board: Board, paths: Sequence[Path], lenses: Calibration) -> Calibrated:
-    """The poses of cameras that see a board, and the height of the table below it.
+    """Computes the poses of cameras that see a board, and the height of the table below the board.
 
     Args:
-        board: at the same place in all images.
+        board: the board, at the same place in all images.
         paths: folders with colour images of the cameras, as for `read_frames`; or colour images of
-            the only camera.
+            a single camera.
         lenses: the cameras' intrinsics; their poses are ignored.
 
     Raises:
         UserError: an image is missing, shows too little of the board or shows it too obliquely, or
-            two poses explain it.
+            its pose is ambiguous.
     """
     results, poses = [], {}
     for camera in lenses.cameras:
@@ -81,7 +82,7 @@ def calibrate_cameras(board: Board, paths: Sequence[Path], lenses: Calibration) 
 
 
 def _images(paths: Sequence[Path], camera: BenchCamera, lenses: Calibration) -> list[Path]:
-    """The colour images of a camera."""
+    """Returns the colour images of a camera."""
     alone = len(lenses.cameras) == 1
     for path in paths:
         if not path.exists():
@@ -89,8 +90,8 @@ def _images(paths: Sequence[Path], camera: BenchCamera, lenses: Calibration) -> 
     files = [path for path in paths if not path.is_dir()]
     if files and not alone:
         raise UserError(
-            f"{files[0]} is of one camera, and the calibration has {len(lenses.cameras)}: give "
-            "folders with NAME_color.png"
+            f"{files[0]} is an image of one camera, but the calibration has {len(lenses.cameras)} "
+            "cameras: give folders with NAME_color.png"
         )
     return [find_color([path], camera.name, alone) if path.is_dir() else path for path in paths]
 
@@ -116,8 +117,8 @@ def _calibrate_camera(board: Board, paths: Sequence[Path], camera: BenchCamera) 
         alone = max(item.rms for item in singles)
         if fit.rms > alone + _MOVED:
             raise UserError(
-                f"{where}: together its images err by {fit.rms:.2f} pixels, and each alone by at "
-                f"most {alone:.2f}: did the board or the camera move between them?"
+                f"{where}: its images err by {fit.rms:.2f} pixels together, and by at most "
+                f"{alone:.2f} pixels each alone: did the board or the camera move between them?"
             )
     corners = sum(len(item.points) for item in seen)
     return CalibratedCamera(camera.name, images[0], seen[0], len(paths), corners, fit)

@@ -1,4 +1,4 @@
-"""The pose of a camera above a board, from the board's corners in its images."""
+"""Computes the pose of a camera above a board, from the board's corners in its images."""
 
 from __future__ import annotations
 
@@ -20,31 +20,33 @@ from kitting_drake.real_camera.frames.point_clouds import project_points
 Array = NDArray[np.float64]
 
 _STEEPEST = math.radians(70)
-"""A board seen at a larger angle from its normal gives poor corners."""
+"""The largest angle, in radians, between a board's normal and the line of sight; beyond it the
+corners are poor."""
 _SAME = math.radians(1)
-"""Poses that differ by less than this count as the same."""
+"""The angle in radians below which two poses count as the same."""
 _CLEARER = 16.0
-"""The squared errors of a second pose must exceed the first's by so many variances of a corner."""
+"""The least difference of the squared errors of the second-best and the best pose, in variances of
+a corner. If it is smaller, the pose is ambiguous."""
 _LIKELY = 0.2
-"""The error of corners that is to be expected in a real image, in pixels."""
+"""The error of corners that is expected in a real image, in pixels."""
 _NOISE = 0.05
 """The error of corners in a good image, in pixels."""
 _WORST = 3.0
-"""If the error is larger than this, in pixels, the lens is another one or the board moved."""
+"""The error of corners, in pixels, above which the lens is another one or the board moved."""
 
 
 @dataclass(frozen=True)
 class BoardFit:
-    """A camera's pose by a board, and how well it explains the corners."""
+    """A camera's pose computed from a board, and how well it explains the corners."""
 
     X_KM: Array
-    """(4, 4): the pose of the board's frame M in the optical frame K."""
+    """The pose (4, 4) of the board's frame M in the optical frame K."""
     rms: float
-    """The error of the corners, in pixels."""
+    """The root mean square error of the corners, in pixels."""
     angle: float
-    """Between the board's normal and the line of sight to its middle, in radians."""
+    """The angle between the board's normal and the line of sight to its middle, in radians."""
     focal_ratio: float
-    """The factor of the focal length that would explain the corners best."""
+    """The factor for the focal length that would explain the corners best."""
     focal_error: float
     """The standard deviation of this factor."""
 
@@ -53,13 +55,13 @@ def fit_board(points: Array, pixels: Array, lens: Intrinsics, where: str) -> Boa
     """Fits the pose of a board to its corners.
 
     Args:
-        points: (n, 3) in the board's frame, in metres.
-        pixels: (n, 2) column and row, from pixel centres.
+        points: (n, 3) the corners in the board's frame, in metres.
+        pixels: (n, 2) the columns and rows of the corners, from pixel centres.
         lens: the image's lens.
-        where: the beginning of errors.
+        where: the beginning of error messages.
 
     Raises:
-        UserError: the corners do not fit, are seen too obliquely, or two poses explain them.
+        UserError: the corners do not fit or are seen too obliquely, or two poses explain them.
     """
     starts = _starts(points, pixels, lens, where)
     fits = sorted(
@@ -68,7 +70,7 @@ def fit_board(points: Array, pixels: Array, lens: Intrinsics, where: str) -> Boa
     X, rms = fits[0]
     if rms > _WORST:
         raise UserError(
-            f"{where}: the corners are {rms:.1f} pixels off, in the mean square: check the "
+            f"{where}: the corners have a root mean square error of {rms:.1f} pixels: check the "
             "intrinsics, the board's sizes, and that neither board nor camera moved"
         )
     for other, other_rms in fits[1:]:
@@ -77,22 +79,22 @@ def fit_board(points: Array, pixels: Array, lens: Intrinsics, where: str) -> Boa
         if turned > _SAME and excess < _CLEARER * max(rms, _LIKELY) ** 2:
             raise UserError(
                 f"{where}: two poses, {math.degrees(turned):.0f} degrees apart, explain the board "
-                "equally well: take it nearer, larger, or more from the side"
+                "equally well: move it closer, use a larger board, or view it more from the side"
             )
     middle = X[:3, :3] @ points.mean(axis=0) + X[:3, 3]
-    # The board's z points up, and the line of sight down.
+    # The board's z points up, and the line of sight points down.
     cosine = -(middle @ X[:3, 2]) / np.linalg.norm(middle)
     angle = float(np.arccos(np.clip(cosine, -1, 1)))
     if angle > _STEEPEST:
         raise UserError(
-            f"{where}: the board is seen {math.degrees(angle):.0f} degrees from its normal: look "
-            f"at it from at most {math.degrees(_STEEPEST):.0f}"
+            f"{where}: the board is seen at {math.degrees(angle):.0f} degrees from its normal: "
+            f"view it at no more than {math.degrees(_STEEPEST):.0f} degrees"
         )
     return BoardFit(X, rms, angle, *_focal_ratio(X, points, pixels, lens))
 
 
 def _starts(points: Array, pixels: Array, lens: Intrinsics, where: str) -> list[Array]:
-    """The two poses that may explain the image of a plane."""
+    """Returns the two poses that may explain the image of a plane."""
     cv2 = import_extra("cv2", purpose="--calibrate", extra="camera")
     u, v = ((pixels - lens.centre) / lens.focal).T
     if lens.distortion:
@@ -111,7 +113,7 @@ def _starts(points: Array, pixels: Array, lens: Intrinsics, where: str) -> list[
 
 
 def _refined(start: Array, points: Array, pixels: Array, lens: Intrinsics) -> tuple[Array, float]:
-    """The pose of least error near a start, and its error in pixels."""
+    """Minimizes the error of a pose from a start; returns the pose and its error in pixels."""
     first = np.concatenate([Rotation.from_matrix(start[:3, :3]).as_rotvec(), start[:3, 3]])
     found = least_squares(_errors, first, args=(points, pixels, lens), method="lm", x_scale="jac")
     X = assembled(Rotation.from_rotvec(found.x[:3]).as_matrix(), found.x[3:6])
@@ -119,7 +121,8 @@ def _refined(start: Array, points: Array, pixels: Array, lens: Intrinsics) -> tu
 
 
 def _errors(values: Array, points: Array, pixels: Array, lens: Intrinsics) -> Array:
-    """(2 n,) in pixels. A seventh value is the logarithm of the focal ratio."""
+    """Returns the errors (2 n,) in pixels. If there is a seventh value, it is the logarithm of the
+    focal ratio."""
     seen = points @ Rotation.from_rotvec(values[:3]).as_matrix().T + values[3:6]
     seen[:, 2] = np.maximum(seen[:, 2], 1e-3)
     found = np.stack(project_points(seen, lens), axis=-1)
@@ -129,7 +132,8 @@ def _errors(values: Array, points: Array, pixels: Array, lens: Intrinsics) -> Ar
 
 
 def _focal_ratio(X: Array, points: Array, pixels: Array, lens: Intrinsics) -> tuple[float, float]:
-    """The factor of the focal length that explains the corners best, and its deviation."""
+    """Returns the factor for the focal length that explains the corners best, and its standard
+    deviation."""
     first = np.concatenate([Rotation.from_matrix(X[:3, :3]).as_rotvec(), X[:3, 3], [0.0]])
     if 2 * len(points) <= len(first):
         return 1.0, math.inf

@@ -1,4 +1,4 @@
-"""Files and a table about cameras that a board calibrated."""
+"""Writes files and prints a table about cameras that were calibrated by a board."""
 
 from __future__ import annotations
 
@@ -19,22 +19,25 @@ from kitting_drake.real_camera.frames.point_clouds import project_points
 from kitting_drake.real_camera.markers.board_calibration import Calibrated, CalibratedCamera
 
 _GOOD, _FAIR = 0.5, 1.5
-"""Errors of corners up to these are good and fair, in pixels."""
+"""The largest errors of corners, in pixels, that count as good and as fair."""
 _TOLD = 0.01
-"""A focal ratio whose deviation is larger than this tells nothing."""
+"""The standard deviation above which a focal ratio says nothing."""
 _AXES = ((230, 40, 40), (40, 180, 40), (60, 90, 255))
 
 
 def clear_earlier(folder: Path, source: Path) -> Path:
-    """Removes the files of an earlier run, so that nobody uses them after a failure; returns the
-    file of the new calibration.
+    """Removes the files of an earlier run, so that nobody uses them after a failure.
 
     Args:
         folder: the folder of the files.
         source: the file of the intrinsics.
 
+    Returns:
+        The path of the new calibration.
+
     Raises:
-        UserError: the file is that of the intrinsics, or is not from an earlier run.
+        UserError: this path is the file of the intrinsics, or holds a file that is not from an
+            earlier run.
     """
     path, record = folder / "calibration.yaml", folder / "calibrate.json"
     if path.resolve() == source.resolve():
@@ -50,7 +53,8 @@ def clear_earlier(folder: Path, source: Path) -> Path:
 
 
 def save_calibrated(path: Path, calibrated: Calibrated) -> None:
-    """Writes the calibration to a file; beside it, `calibrate.json` and a picture of each camera.
+    """Writes the calibration to a file, and `calibrate.json` and a picture of each camera beside
+    it.
 
     Raises:
         UserError: a file cannot be written.
@@ -123,8 +127,11 @@ def _record(calibrated: Calibrated) -> dict[str, Any]:
 
 
 def _draw(result: CalibratedCamera, camera: BenchCamera, calibrated: Calibrated) -> bytes:
-    """A PNG of the first image: circles at the corners seen, crosses where the pose predicts them,
-    and the board's axes."""
+    """Draws the first image as a PNG.
+
+    Circles mark the detected corners, crosses the corners predicted by the pose. The board's axes
+    are drawn as well.
+    """
     lens = camera.intrinsics if camera.color is None else camera.color.intrinsics
     X = result.fit.X_KM
     image = Image.fromarray(result.image)

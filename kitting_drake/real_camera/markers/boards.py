@@ -31,37 +31,37 @@ _FIELDS = (
 )
 _CORNERS = ("bottom_left", "bottom_right", "top_left")
 _NEEDED = 12
-"""A pose needs at least this many corners."""
+"""The least number of corners for a pose."""
 _SHIFT = 0.42
-"""About the shift of OpenCV's refinement of AprilTags, in pixels."""
+"""The approximate shift of corners by OpenCV's refinement of AprilTags, in pixels."""
 _LEVEL = math.radians(3)
-"""A board that is tilted by more than this does not lie on the table."""
+"""The largest tilt, in radians, of a board that lies on the table."""
 _TOUCHED = 0.003
 """The largest error of the distance between touched corners, in metres."""
 _LARGEST = 2.0
-"""If a board is larger than this, in metres, its sizes are probably in millimetres."""
+"""The size in metres above which a board's sizes are probably in millimetres."""
 
 
 @dataclass(frozen=True)
 class Board:
     """A board of markers that lies flat on the table.
 
-    Its frame, seen from above with the print upright: the origin in the bottom left corner of the
-    pattern, x to the right, y up along the print, and z out of it.
+    The board's frame M, as seen from above with the print upright: the origin is the lower left
+    corner of the pattern, x points right, y up along the print, and z out of the print.
     """
 
     path: Path
-    """The file of its description, for errors."""
+    """The file with the board's description, for error messages."""
     pattern: Any
     """OpenCV's board."""
     size: tuple[float, float]
     """The size of the pattern along x and y, in metres."""
     is_chessboard: bool
-    """Whether it has the corners of a chessboard (ChArUco) beside those of its markers."""
+    """Whether the board has chessboard corners (ChArUco) besides those of its markers."""
     count: int
     """The number of all corners."""
     X_BM: Array
-    """(4, 4): the pose of its frame M in the base frame B."""
+    """The pose (4, 4) of the board's frame M in the base frame B."""
     thickness: float = 0.0
     """The height of the print above the table, in metres."""
 
@@ -73,27 +73,27 @@ class Board:
 
     @property
     def tilt(self) -> float:
-        """The angle between its z and the base's, in radians."""
+        """The angle between the board's z and the base's z, in radians."""
         return float(np.arccos(np.clip(self.X_BM[2, 2], -1, 1)))
 
 
 @dataclass(frozen=True)
 class SeenBoard:
-    """The corners of a board in an image."""
+    """The corners of a board that were found in an image."""
 
     points: Array
-    """(n, 3): in the board's frame, in metres."""
+    """The corners (n, 3) in the board's frame, in metres."""
     pixels: Array
-    """(n, 2): column and row, from pixel centres."""
+    """The columns and rows (n, 2) of the corners, from pixel centres."""
     markers: int
-    """The number of markers seen."""
+    """The number of markers found."""
 
 
 def read_board(path: Path) -> Board:
     """Reads the description of a board; docs/bench.md has an example.
 
     Raises:
-        UserError: a field is missing or invalid; names it.
+        UserError: a field is missing or invalid. The message names the field.
         MachineError: OpenCV is missing.
     """
     content = read_yaml(path)
@@ -102,7 +102,7 @@ def read_board(path: Path) -> Board:
     if kind not in _TYPES:
         raise UserError(
             f"{path}: type must be charuco, apriltag or aruco, not {kind!r} (kalibr's aprilgrid "
-            "has other borders, and is not read)"
+            "cannot be read, because it has other borders)"
         )
     cv2 = _opencv()
     dictionary = _dictionary(cv2, content, path)
@@ -114,7 +114,9 @@ def read_board(path: Path) -> Board:
     first = int(number(content.get("first_id", 0), f"{path}: first_id"))
     needed = columns * rows // 2 if kind == "charuco" else first + columns * rows
     if not 0 <= first <= needed <= held:
-        raise UserError(f"{path}: the board needs {needed} markers, and its dictionary has {held}")
+        raise UserError(
+            f"{path}: the board needs {needed} markers, but its dictionary has only {held}"
+        )
     try:
         if kind == "charuco":
             square = _length(content, "square", path)
@@ -130,8 +132,8 @@ def read_board(path: Path) -> Board:
             count = 4 * columns * rows
     except (cv2.error, SystemError) as error:
         raise UserError(
-            f"{path}: there is no board of {columns}x{rows} with these sizes: a marker must be "
-            "smaller than a square"
+            f"{path}: OpenCV cannot make a board of {columns}x{rows} with these sizes: a marker "
+            "must be smaller than a square"
         ) from error
     if max(size) > _LARGEST:
         raise UserError(f"{path}: the board would be {max(size):g} m long: give sizes in metres")
@@ -148,10 +150,10 @@ def read_board(path: Path) -> Board:
 
 
 def find_corners(board: Board, image: NDArray[np.uint8], where: str) -> SeenBoard:
-    """The corners of a board in an image (height, width, 3).
+    """Finds the corners of a board in an image (height, width, 3).
 
     Raises:
-        UserError: too little of the board is seen; says how much.
+        UserError: too few corners are visible. The message says how many.
     """
     cv2 = _opencv()
     gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
@@ -183,9 +185,11 @@ def find_corners(board: Board, image: NDArray[np.uint8], where: str) -> SeenBoar
 
 
 def _find_markers(cv2: Any, board: Board, gray: Any) -> tuple[dict[int, Array], list[int]]:
-    """The corners (4, 2) of the board's markers by number, and the numbers of other markers."""
+    """Returns the corners (4, 2) of the board's markers by number, and the numbers of other
+    markers."""
     parameters = cv2.aruco.DetectorParameters()
-    # It fits lines to the sides, so its corners err only a quarter as much as other refinements'.
+    # The AprilTag refinement fits lines to the sides, so its corners err only a quarter as much as
+    # those of other refinements.
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_APRILTAG
     detector = cv2.aruco.ArucoDetector(board.pattern.getDictionary(), parameters)
     corners, numbers, _ = detector.detectMarkers(gray)
@@ -201,10 +205,10 @@ def _find_markers(cv2: Any, board: Board, gray: Any) -> tuple[dict[int, Array], 
 
 
 def _centred(cv2: Any, gray: Any, quads: list[Array]) -> list[Array]:
-    """The same corners of markers, counted from pixel centres.
+    """Corrects the corners (4, 2) of markers so that they are counted from pixel centres.
 
-    The refinement shifts all corners by about 0.4 pixels. A second refinement, which is noisier but
-    without such a bias, tells by how much.
+    OpenCV's AprilTag refinement shifts all corners by about 0.4 pixels. A second refinement, which
+    is noisier but has no such bias, shows the exact shift.
     """
     if not quads:
         return []
@@ -219,7 +223,8 @@ def _centred(cv2: Any, gray: Any, quads: list[Array]) -> list[Array]:
 
 
 def _in_own_frame(points: Array, height: float) -> Array:
-    """From OpenCV's frame of a board: the origin in the top left corner, y down, z into it."""
+    """Converts points from OpenCV's frame of a board: origin in the top left corner, y down, z into
+    it."""
     return points * [1, -1, -1] + [0, height, 0]
 
 
@@ -249,10 +254,10 @@ def _length(content: dict[str, Any], key: str, path: Path) -> float:
 
 
 def _pose(content: dict[str, Any], size: tuple[float, float], path: Path) -> Array:
-    """(4, 4): of the board in the base, as given or from touched corners."""
+    """Returns the pose (4, 4) of the board in the base, as given or from touched corners."""
     if ("pose" in content) == ("touch" in content):
         raise UserError(
-            f"{path} must have either pose, of the board in the base frame, or touch, with the "
+            f"{path} must have either pose (of the board in the base frame), or touch with the "
             f"positions of {', '.join(_CORNERS)}"
         )
     if "pose" in content:

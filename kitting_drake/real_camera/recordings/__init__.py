@@ -1,1 +1,1 @@
-"""Recordings of ROS: bags of ROS 1 and 2, MCAP files, and RealSense's."""
+"""Reads recordings: bags of ROS 1 and ROS 2, MCAP files, and RealSense's recordings."""

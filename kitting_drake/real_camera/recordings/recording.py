@@ -19,13 +19,14 @@ _ENDINGS = (".bag", ".mcap", ".db3")
 
 @dataclass(frozen=True)
 class RecordedMessage:
-    """A message of a recording."""
+    """One message of a recording."""
 
     topic: str
     since: float
-    """When it was recorded, in seconds after the recording's first message."""
+    """The time of recording, in seconds after the recording's first message."""
     stamp: float
-    """When it was taken, by its header, or else when it was recorded; in seconds."""
+    """The time of measurement by the message's header, or else the time of recording; in
+    seconds."""
     body: Any
 
 
@@ -38,16 +39,16 @@ class Recording:
         """The types of messages by topic, in the style of ROS 2."""
 
     def topics(self, *kinds: str) -> list[str]:
-        """The topics whose messages are of one of some types, sorted."""
+        """Returns the topics whose messages are of one of the given types, sorted."""
         return sorted(topic for topic, kind in self.kinds.items() if kind in kinds)
 
     def messages(self, topics: Sequence[str]) -> Iterator[RecordedMessage]:
-        """The messages of some topics, in the order of recording."""
+        """Yields the messages of the given topics, in the order of recording."""
         raise NotImplementedError
 
 
 def is_recording(path: Path) -> bool:
-    """Whether a path is a file of a recording, or a folder of ROS 2."""
+    """Whether a path is a recording's file, or a folder with a ROS 2 recording."""
     return path.suffix in _ENDINGS or (path / "metadata.yaml").is_file()
 
 
@@ -56,8 +57,8 @@ def open_recording(path: Path) -> Iterator[Recording]:
     """Opens a recording.
 
     Raises:
-        UserError: it is damaged.
-        MachineError: a library is missing; names it.
+        UserError: the recording is damaged.
+        MachineError: a library is missing. The message names it.
     """
     if not path.exists():
         raise UserError(f"there is no recording {path}")
@@ -68,7 +69,7 @@ def open_recording(path: Path) -> Iterator[Recording]:
     else:
         folder = path.parent if path.is_file() else path
         if not (folder / "metadata.yaml").is_file():
-            raise UserError(f"{path} lacks the metadata.yaml beside it: run `ros2 bag reindex`")
+            raise UserError(f"{path} has no metadata.yaml beside it: run `ros2 bag reindex`")
         opened = _open_rosbag(folder, "rosbag2", "ROS2_HUMBLE", "deserialize_cdr")
     try:
         with opened as recording:
@@ -76,20 +77,20 @@ def open_recording(path: Path) -> Iterator[Recording]:
     except UserError:
         raise
     except Exception as error:
-        # For damaged files the libraries raise exceptions of a dozen other libraries.
+        # For damaged files, the libraries raise exceptions of a dozen other libraries.
         told = str(error).partition("\n")[0].strip("= ") or type(error).__name__
         raise UserError(f"the recording {path} is damaged or not complete: {told}") from error
 
 
 def camera_info_of(path: Path, stream: str) -> dict[str, Any]:
-    """The first CameraInfo of a recording, as its fields in ROS 2.
+    """Returns the first CameraInfo of a recording, as its fields in ROS 2.
 
     Args:
         path: the recording's path.
-        stream: the topic, a part of it, or a name that counts only if it is a part of one.
+        stream: the topic, or a part of it. A camera's name is used only if it is a part of a topic.
 
     Raises:
-        UserError: there is no such topic, or several.
+        UserError: there is no such topic, or several match.
     """
     with open_recording(path) as recording:
         topics = recording.topics(CAMERA_INFO)
@@ -107,7 +108,7 @@ def camera_info_of(path: Path, stream: str) -> dict[str, Any]:
 
 
 def camera_info_fields(body: Any) -> dict[str, Any]:
-    """The fields of a CameraInfo's message, by their names in ROS 2, for the calibration."""
+    """Returns the fields of a CameraInfo message, by their names in ROS 2, for the calibration."""
     roi = body.roi
     return {
         "width": int(body.width),
@@ -124,7 +125,7 @@ def camera_info_fields(body: Any) -> dict[str, Any]:
 
 
 class _Rosbag(Recording):
-    """A recording that the package rosbags reads."""
+    """A recording that is read by the package rosbags."""
 
     def __init__(self, path: Path, reader: Any, deserialize: Any) -> None:
         kinds = {item.topic: item.msgtype for item in reader.connections}
@@ -145,13 +146,13 @@ class _Mcap(Recording):
     def __init__(self, path: Path, reader: Any) -> None:
         summary = reader.get_summary()
         if summary is None or summary.statistics is None:
-            raise UserError(f"{path} is not complete: repair it by `mcap recover {path.name}`")
+            raise UserError(f"{path} is not complete: repair it with `mcap recover {path.name}`")
         kinds = {}
         for channel in summary.channels.values():
             if channel.message_encoding != "cdr":
                 raise UserError(
-                    f"{path} has messages in {channel.message_encoding}: only those of ROS 2, in "
-                    "cdr, can be read"
+                    f"{path} has messages encoded as {channel.message_encoding}: only those of "
+                    "ROS 2, encoded as cdr, can be read"
                 )
             kinds[channel.topic] = summary.schemas[channel.schema_id].name
         super().__init__(path, kinds)

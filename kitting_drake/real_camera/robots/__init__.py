@@ -1,1 +1,1 @@
-"""The arm of a bench, and files of its trajectories."""
+"""The robot arm of a real bench, and the files of its trajectories."""

@@ -1,4 +1,4 @@
-"""The arm of a bench: what it is, and where it stands."""
+"""The robot arm of a real bench: its model, its base, and its home."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ from systems.signals import PickPlaceAction, SurfaceHeights
 
 _FIELDS = ("model", "base", "yaw_deg", "home", "joints", "rate")
 _FARTHEST = 3.0
-"""Coordinates beyond this are probably in millimetres."""
+"""The size of a coordinate, in metres, above which it is probably in millimetres."""
 
 
 @dataclass(frozen=True)
 class BenchRobot:
-    """A Franka arm with its hand beside a table."""
+    """A Franka arm with its hand, beside a table."""
 
     model: str = "fr3"
-    """`fr3` or `panda`."""
+    """The arm's model, `fr3` or `panda`."""
     base: ArmBase = dataclasses.field(default_factory=ArmBase)
     """The pose of the arm's base in the calibration's base frame."""
     home: tuple[float, float, float, float] | None = None
-    """The hand waits at this x, y, height of the fingertips (m) and yaw (rad); None: at the cell's
-    `planner.home`. After an action it returns to this x, and keeps its y if it can."""
+    """The x, y, height of the fingertips (m) and yaw (rad) at which the hand waits; None: the
+    cell's `planner.home`. After an action it returns to this x, and keeps its y if it can."""
     joints: tuple[float, ...] | None = None
-    """Seven joint positions from which it starts, in rad; None: those of the home."""
+    """The seven joint positions from which the arm starts, in rad; None: those of the home."""
     rate: int = FASTEST_RATE
-    """Points of a trajectory in a second."""
+    """The number of points of a trajectory per second."""
 
     @property
     def limits(self) -> ArmLimits:
@@ -48,11 +48,11 @@ class BenchRobot:
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """As in Franka's URDF: `fr3_joint1` to `fr3_joint7`."""
+        """The joints' names in Franka's URDF: `fr3_joint1` to `fr3_joint7`, or the Panda's."""
         return tuple(f"{self.model}_joint{number}" for number in range(1, JOINTS + 1))
 
     def as_dict(self) -> dict[str, Any]:
-        """The content of its file."""
+        """Returns the content of the arm's file."""
         base = self.base
         record: dict[str, Any] = {
             "model": self.model,
@@ -66,12 +66,15 @@ class BenchRobot:
     def plan(
         self, action: PickPlaceAction, surfaces: SurfaceHeights, parameters: PickPlaceParameters
     ) -> ArmTrajectory | str:
-        """The trajectory of an action, or a sentence that says why the arm cannot do it.
+        """Plans the trajectory of an action.
 
         Args:
             action: a pick and place or a press, in the base frame of the calibration.
-            surfaces: heights around pick and place.
-            parameters: the motion's.
+            surfaces: the heights around pick and place.
+            parameters: the parameters of the motion.
+
+        Returns:
+            The trajectory, or a sentence that says why the arm cannot move so.
 
         Raises:
             UserError: the arm cannot reach its home.
@@ -91,7 +94,7 @@ def read_robot(path: Path) -> BenchRobot:
     """Reads the description of an arm; docs/bench.md has an example.
 
     Raises:
-        UserError: a field is missing or invalid; names it.
+        UserError: a field is missing or invalid. The message names the field.
     """
     content = read_yaml(path)
     check_fields(content, _FIELDS, str(path))
@@ -100,7 +103,7 @@ def read_robot(path: Path) -> BenchRobot:
         raise UserError(f"{path}: model must be {' or '.join(ARM_LIMITS)}, not {model!r}")
     x, y, z = matrix(content.get("base", [0, 0, 0]), 1, 3, f"{path}: base")[0].tolist()
     if max(abs(x), abs(y), abs(z)) > _FARTHEST:
-        raise UserError(f"{path}: base is ({x:g}, {y:g}, {z:g}): give it in m")
+        raise UserError(f"{path}: base is ({x:g}, {y:g}, {z:g}): give it in metres")
     yaw = number(content.get("yaw_deg", 0), f"{path}: yaw_deg")
     home = joints = None
     if "home" in content:
@@ -117,10 +120,10 @@ def read_robot(path: Path) -> BenchRobot:
 
 
 def check_rate(value: object, where: str) -> int:
-    """A rate of a trajectory's points.
+    """Checks the number of a trajectory's points per second.
 
     Raises:
-        UserError: it is out of range; names the field.
+        UserError: the value is out of range. The message names the field.
     """
     rate = number(value, where)
     if rate != int(rate) or not SLOWEST_RATE <= rate <= FASTEST_RATE:

@@ -1,4 +1,4 @@
-"""Files of a joint trajectory: JSON with ROS's `trajectory_msgs/JointTrajectory`, and CSV."""
+"""Writes joint trajectories as JSON with ROS's `trajectory_msgs/JointTrajectory`, and as CSV."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ def save_trajectory(
     """Writes `trajectory.json` and `trajectory.csv`; docs/bench.md describes them.
 
     Args:
-        folder: where to write.
-        trajectory: what to write.
-        joint_names: of the seven joints.
-        robot: describes the arm; copied into the JSON.
+        folder: the folder for the files.
+        trajectory: the trajectory to write.
+        joint_names: the names of the seven joints.
+        robot: a description of the arm, which is copied into the JSON.
 
     Raises:
         MachineError: a file cannot be written.
@@ -55,7 +55,7 @@ def _json_text(trajectory: ArmTrajectory, joint_names: Sequence[str], robot: dic
         | {"time_from_start": _ros_time(i / trajectory.rate)}
         for i in range(len(trajectory.positions))
     ]
-    # A point on each line.
+    # Put each point on a line of its own.
     text = json.dumps(head, indent=2).removesuffix("\n}")
     names = json.dumps(list(joint_names))
     lines = ",\n".join(f"      {json.dumps(point)}" for point in points)

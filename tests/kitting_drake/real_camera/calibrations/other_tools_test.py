@@ -117,7 +117,7 @@ def test_a_camera_on_the_hand_needs_the_hand(tmp_path: Path, text: str):
     if "panda" not in text:
         found = read(tmp_path, f"{texts.LENS}    pose: eye\n    hand_to_base: tf", tf=tf)
         same(found.X_BC, X_BC @ X_BC)
-    with pytest.raises(UserError, match="is the pose of wrist_3, but the camera's is given in"):
+    with pytest.raises(UserError, match="is the pose of wrist_3, but the camera's pose is in"):
         wrong = tf.replace("tool0", "wrist_3")
         read(tmp_path, f"{texts.LENS}    pose: eye\n    hand_to_base: tf", tf=wrong)
 
@@ -142,11 +142,11 @@ def test_frames_tell_the_direction(tmp_path: Path):
         "tf2_echo front_color_optical_frame base_link",
     )
     same(read(tmp_path, f"{texts.LENS}    pose: tf", tf=turned).X_BC, np.linalg.inv(X_BC))
-    with pytest.raises(UserError, match="which is not camera_to_base: call it pose"):
+    with pytest.raises(UserError, match="which is not camera_to_base: rename the field to pose"):
         read(tmp_path, f"{texts.LENS}    camera_to_base: tf", tf=turned)
     same(read(tmp_path, f"{texts.LENS}    base_to_camera: tf", tf=turned).X_BC, np.linalg.inv(X_BC))
     strange = texts.TF2_ECHO.replace("base_link", "cell").replace("front_color_optical_frame", "A")
-    with pytest.raises(UserError, match="A in cell, and the names do not tell"):
+    with pytest.raises(UserError, match="A in cell, and it is not clear"):
         read(tmp_path, f"{texts.LENS}    pose: tf", tf=strange)
     names = "base_frame: cell\n    camera_frame: A"
     same(read(tmp_path, f"{texts.LENS}    pose: tf\n    {names}", tf=strange).X_BC, X_BC)
@@ -249,13 +249,13 @@ K = "width: 64\n    height: 48\n    k: [50, 0, 31.5, 0, 51, 23.25, 0, 0, 1]\n"
     [
         (K.replace("50, 0", "50, 7.5"), "k has a skew of 7.5 pixels"),
         (K + "    d: [0.1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0.01, 0]\n", "d has a tilted sensor"),
-        (K + "    binning_x: 2\n", "binning_x is 2, so images are smaller"),
+        (K + "    binning_x: 2\n", "binning_x is 2, so the images are smaller"),
         (K + "    roi: {x_offset: 8, y_offset: 0, width: 32, height: 48}\n", "images are cropped"),
         (K + "    distortion_model: equidistant\n", "equidistant needs distortion"),
         (K + "    distortion_model: equi\n    d: [0.1, 0]\n", "d must hold 4 numbers, not 2"),
         (K + "    distortion_model: omni\n    d: [0.1, 0]\n", "distortion_model omni cannot be"),
         (K + "    image_Width: 64\n", "has width and image_Width: give one of them"),
-        (K + "    camera_to_hand: tf\n", "has pose and camera_to_hand: give one pose"),
+        (K + "    camera_to_hand: tf\n", "has pose and camera_to_hand: give only one pose"),
         ("intrinsics: lens\n    camera_info: lens\n", "has camera_info and intrinsics: give one"),
         ("intrinsics: nothing\n", r"cannot read .*nothing: No such file"),
         (K + "    color: {fx: 3}\n", "color lacks depth_to_color: 4 x 4 numbers"),
@@ -281,11 +281,14 @@ MOVING = texts.TF_ECHO + texts.TF_ECHO.replace("0.500", "0.510")
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (MOVING, "the frame moves between its 2 poses"),
-        (texts.TF_ECHO.replace(", 0.900]", "]"), "three numbers of Translation and four of Quat"),
+        (MOVING, "the frame moves between the 2 poses"),
+        (
+            texts.TF_ECHO.replace(", 0.900]", "]"),
+            "three numbers after Translation and four after Quat",
+        ),
         (texts.TF_ECHO.partition("- Rotation")[0] + "- Rotation:", "is not complete: tf2_echo"),
         (texts.TF_ECHO.replace("0.70710678", "0.9"), "must be a unit quaternion"),
-        (texts.TF_ECHO.replace("0.900", "900"), "positions are in metres"),
+        (texts.TF_ECHO.replace("0.900", "900"), "give positions in metres"),
         (texts.EASY_HANDEYE.replace("  qw: 0.0\n", ""), "transformation lacks 'qw'"),
         (texts.EASY_HANDEYE.replace("eye_on_hand: false", "eye: 1"), "lacks eye_on_hand"),
         (texts.EASY_HANDEYE2.replace("eye_on_base", "both"), "must be eye_in_hand or eye_on_base"),

@@ -78,7 +78,7 @@ def test_an_outline_survives_writing(tmp_path: Path):
         ({"ignore": [LEFT, BASE[:2]]}, r"ignore\[1\] has 2 corners"),
         ({"region": (1e3 * np.array(LEFT) + 1e4).tolist()}, "region covers no pixel.* metres"),
         ({"ignore": [(np.array(BASE) - 1).tolist()]}, r"ignore\[0\] covers no pixel of the work"),
-        ({"region": BASE, "ignore": [LEFT]}, "leave nothing of the workspace"),
+        ({"region": BASE, "ignore": [LEFT]}, "together leave no pixel of the workspace"),
         ({"region_mask": "small.png"}, "has 10 rows and 20 columns, but the workspace has 160"),
         ({"region_mask": "nowhere.png"}, "cannot read .*nowhere.png: No such file"),
         ({"region_mask": "calibration.yaml"}, "it is not an image"),

@@ -249,7 +249,11 @@ def test_images_that_tell_nothing_are_refused(tmp_path: Path):
         (CHARUCO, [good[:, :600]], "is 600x480 pixels, but camera front was calibrated at 640x48"),
         (CHARUCO, [good, render(board, little)], "did the board or the camera move between them"),
         (CHARUCO, [good, render(board, much)], "and that neither board nor camera moved"),
-        (CHARUCO, [render(board, above(board, 75, 0.45))], r"is seen 7\d degrees from its normal"),
+        (
+            CHARUCO,
+            [render(board, above(board, 75, 0.45))],
+            r"is seen at 7\d degrees from its normal",
+        ),
     ]
     for text, images, message in cases:
         with pytest.raises(UserError, match=message) as raised:
@@ -289,7 +293,7 @@ def test_wrong_sizes_are_noticed(tmp_path: Path):
     path = lenses(tmp_path, "front")
     path.write_text(path.read_text().replace("fx: 600", "fx: 400"))
     frame = save(tmp_path / "frame", image)
-    with pytest.raises(UserError, match=r"the corners are .* pixels off, in the mean square"):
+    with pytest.raises(UserError, match=r"root mean square error of .* pixels"):
         calibrate_cameras(board, [frame], read_calibration(path, poses=False))
 
 
@@ -298,14 +302,14 @@ def test_wrong_sizes_are_noticed(tmp_path: Path):
     [
         ("charuco", "aprilgrid", "type must be charuco, apriltag or aruco, not 'aprilgrid'"),
         ("5X5_100", "5X5_99", "there is no dictionary 5X5_99: give one of"),
-        ("marker: 0.03", "marker: 0.05", "there is no board of 7x5 with these sizes"),
+        ("marker: 0.03", "marker: 0.05", "cannot make a board of 7x5 with these sizes"),
         ("square: 0.04", "square: 40", "the board would be 280 m long: give sizes in metres"),
         ("square: 0.04", "square: 0", "square must be more than 0, in metres"),
         ("columns: 7", "columns: 0", "columns must be a whole number of 1 or more"),
         ("columns: 7\n", "", "board.yaml lacks 'columns'"),
         ("square:", "sqare:", "unknown field 'sqare': did you mean 'square'"),
         ("rpy_deg: [0, 0, 30]", "rpy_deg: [180, 0, 30]", "is tilted by 180.0 degrees: it must lie"),
-        (POSE, "", "must have either pose, of the board in the base frame, or touch"),
+        (POSE, "", "must have either pose .of the board in the base frame., or touch"),
     ],
 )
 def test_descriptions_that_cannot_be_used_are_refused(
@@ -318,7 +322,9 @@ def test_descriptions_that_cannot_be_used_are_refused(
 
 
 def test_a_large_board_has_enough_markers(tmp_path: Path):
-    with pytest.raises(UserError, match="the board needs 450 markers, and its dictionary has 100"):
+    with pytest.raises(
+        UserError, match="the board needs 450 markers, but its dictionary has only 100"
+    ):
         described(tmp_path, CHARUCO.replace("columns: 7\nrows: 5", "columns: 30\nrows: 30"))
 
 
@@ -326,7 +332,9 @@ def test_files_are_of_the_only_camera(tmp_path: Path):
     board = described(tmp_path, CHARUCO)
     save(tmp_path / "frame1", np.zeros((480, 640, 3), np.uint8), "front_color.png")
     lens = read_calibration(lenses(tmp_path, "front", "rear"), poses=False)
-    with pytest.raises(UserError, match=r"is of one camera, and the calibration has 2: give fold"):
+    with pytest.raises(
+        UserError, match=r"is an image of one camera, but the calibration has 2 cameras: give fold"
+    ):
         calibrate_cameras(board, [tmp_path / "frame1" / "front_color.png"], lens)
     with pytest.raises(UserError, match="there is no frame"):
         calibrate_cameras(board, [tmp_path / "nothing"], lens)

@@ -317,8 +317,8 @@ def test_a_missing_library_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 def test_a_recording_is_given_alone(tmp_path: Path):
     path = written(tmp_path, "bag")
-    with pytest.raises(UserError, match=r"a.bag is a recording: give it alone"):
+    with pytest.raises(UserError, match=r"a.bag is a recording: give no other files"):
         read_frames([path, path], Calibration((CAMERA,), PixelGrid()))
     (tmp_path / "x.db3").touch()
-    with pytest.raises(UserError, match=r"lacks the metadata.yaml beside it: run `ros2 bag rei"):
+    with pytest.raises(UserError, match=r"has no metadata.yaml beside it: run `ros2 bag rei"):
         read(tmp_path / "x.db3")
