@@ -1,1 +1,1 @@
-"""The command `benchmark`, with measurements on this machine, and the page of results."""
+"""Reproduces the paper's experiments: the command `benchmark`, and the pages of results."""

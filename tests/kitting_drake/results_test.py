@@ -321,7 +321,7 @@ def test_a_run_is_added_and_removed(folder: Path, monkeypatch: pytest.MonkeyPatc
     (evaluated / "summary.json").write_text(json.dumps(summary | {"outcomes": []}))
     with pytest.raises(UserError, match="has another run 'mine': give another name"):
         command(monkeypatch, folder, "--add", "mine", str(evaluated))
-    with pytest.raises(UserError, match=r"'unseen_so2_180_100' is not that of the cell"):
+    with pytest.raises(UserError, match=r"'unseen_so2_180_100' does not fit the cell"):
         command(monkeypatch, folder, "--add", "unseen_so2_180_100", str(evaluated))
     command(monkeypatch, folder, "--remove", "mine", "--quiet")
     assert {path: path.read_bytes() for path in before} == before

@@ -119,7 +119,7 @@ def _parameters(request: KitRequest) -> KitParameters:
         ("--compensate_mm", request.compensate_mm, -1.0, 1.0),
     ):
         if value is not None and not low <= value <= high:
-            raise UserError(f"{flag} is {value:g}, out of range: give {low:g} to {high:g}")
+            raise UserError(f"{flag} {value:g} is out of range: give {low:g} to {high:g}")
     if request.clearance_mm is not None:
         parameters.clearance = round(1e-3 * request.clearance_mm, 7)
         # Keep the outline's simplification small compared to the clearance.
@@ -136,7 +136,7 @@ def _parameters(request: KitRequest) -> KitParameters:
         ):
             if not low <= value <= high:
                 raise UserError(
-                    f"--block_mm: the {name} is {value:g}, out of range: give {low:g} to {high:g}"
+                    f"--block_mm: a {name} of {value:g} is out of range: give {low:g} to {high:g}"
                 )
         parameters.length, parameters.width, parameters.height = (
             round(1e-3 * value, 7) for value in request.block_mm

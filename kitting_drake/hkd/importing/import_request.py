@@ -63,7 +63,7 @@ def check_request(request: ImportRequest) -> None:
         ("--height_mm", request.height_mm, THINNEST_MM, HIGHEST_MM),
     ):
         if value is not None and not low <= value <= high:
-            raise UserError(f"{flag} is {value:g}, out of range: give {low:g} to {high:g}")
+            raise UserError(f"{flag} {value:g} is out of range: give {low:g} to {high:g}")
     units = drawn_curves.UNITS_MM if is_outline(request.mesh) else UNITS_MM
     for flag, name, names in (
         ("--unit", request.unit, units),

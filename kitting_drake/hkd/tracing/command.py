@@ -187,7 +187,7 @@ def _scale(args: argparse.Namespace) -> "Scale | None":
         return Scale(points=tuple(args.scale_px), length_mm=args.scale_mm)
     if args.disc_mm is not None:
         if not 5 <= args.disc_mm <= 300:
-            raise UserError(f"--disc_mm is {args.disc_mm:g}, out of range: give 5 to 300")
+            raise UserError(f"--disc_mm {args.disc_mm:g} is out of range: give 5 to 300")
         return Scale(disc_mm=args.disc_mm)
     if args.board is not None:
         columns, rows, square, marker = args.board

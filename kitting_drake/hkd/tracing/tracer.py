@@ -141,7 +141,7 @@ def _checked(request: TraceRequest) -> str:
     ):
         for value in values:
             if not low <= value <= high:
-                raise UserError(f"{flag} is {value:g}, out of range: give {low:g} to {high:g}")
+                raise UserError(f"{flag} {value:g} is out of range: give {low:g} to {high:g}")
     return name
 
 

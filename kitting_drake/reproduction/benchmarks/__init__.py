@@ -1,1 +1,1 @@
-"""The measurements of the command `benchmark`, except for those of networks and the paper."""
+"""The measurements of `benchmark` that do not concern networks or the paper's tables."""

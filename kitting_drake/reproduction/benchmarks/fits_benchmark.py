@@ -1,7 +1,8 @@
-"""`benchmark fits`: strict success and peak force against the clearance of the cavities.
+"""Measures strict success and peak force against the clearance of the cavities (`benchmark fits`).
 
-Shape matching kits four tools into cavities of 2 to 0.3 mm of clearance a side, with perfect and
-with moderate sensing, with and without the search of a blocked insertion.
+Shape matching places four tools into cavities with 2 to 0.3 mm of clearance on each side. It does
+so with perfect and with moderate sensing, and with and without the hand's search after a blocked
+insertion.
 """
 
 import itertools
@@ -25,7 +26,7 @@ from kitting_drake.scenario.choosing import ChosenScenario, find_scenario
 
 CLEARANCES_MM = (2.0, 1.0, 0.5, 0.3)
 SENSING = {"perfect": None, "moderate": "calibration:moderate,depth_noise:moderate"}
-"""The names of the kinds of sensing, and their perturbations."""
+"""The kinds of sensing by name, and the perturbations of each."""
 
 _SCENARIO = Path("scenarios/kitting_oracle.yaml")
 _WITHOUT_SEARCH = "search: {amplitude: 0.0, reach: 0.0}"
@@ -34,16 +35,16 @@ _LINES = "episodes.jsonl"
 
 @dataclass(frozen=True)
 class Fit:
-    """The conditions of an episode."""
+    """The conditions of an episode: clearance, sensing and search."""
 
     clearance_mm: float
     sensing: str
-    """A key of `SENSING`."""
+    """The kind of sensing, a key of `SENSING`."""
     search: bool
-    """Whether a blocked insertion searches for the cavity."""
+    """Whether the hand searches for the cavity after a blocked insertion."""
 
     def choose(self) -> ChosenScenario:
-        """The scenario with these conditions."""
+        """Returns the scenario with these conditions."""
         planner = "" if self.search else f", planner: {{{_WITHOUT_SEARCH}}}"
         text = (
             f"{{task: {{kit: {{clearance: {self.clearance_mm / 1e3:g}}}}}, "
@@ -61,20 +62,21 @@ FITS = [
 def measure_fits(
     episodes: int, seed: int, folder: Path, console: Console, fits: Sequence[Fit] = tuple(FITS)
 ) -> dict[str, Any]:
-    """Runs the episodes of all conditions, seed by seed; skips those in the folder.
+    """Runs the episodes of all conditions, seed by seed; skips those that are in the folder
+    already.
 
     Args:
-        episodes: the number for each of the conditions.
-        seed: the seed of the first; the others follow.
+        episodes: the number of episodes for each of the conditions.
+        seed: the first seed; the others follow.
         folder: the folder of `episodes.jsonl`.
-        console: where to show progress.
+        console: the console for the progress.
         fits: the conditions.
 
     Returns:
         The commit, the seeds and the summary of each condition; see `summarize_fit`.
 
     Raises:
-        UserError: the folder holds other files or the episodes of another version.
+        UserError: the folder holds other files, or the episodes of another version.
     """
     claim_folder(
         folder,
@@ -105,7 +107,8 @@ def measure_fits(
 
 
 def summarize_fit(fit: Fit, episodes: Sequence[Episode]) -> dict[str, Any]:
-    """The strict successes, causes and forces of the episodes of one condition."""
+    """Summarizes the strict successes, causes of failure and forces of the episodes of one
+    condition."""
     objects = [item for items in counted_objects(episodes) for item in items]
     strict = sum(item["strict_success"] for item in objects)
     forces = [peak["force"] for peak in peak_forces(episodes)]
@@ -128,7 +131,7 @@ def summarize_fit(fit: Fit, episodes: Sequence[Episode]) -> dict[str, Any]:
 
 
 def fits_table(measured: dict[str, Any]) -> Table:
-    """A row for each condition."""
+    """Makes a table of the measurements, with a row for each condition."""
     table = Table(title="strict success against the clearance")
     for heading in ("clearance, mm", "sensing", "search"):
         table.add_column(heading)

@@ -1,4 +1,4 @@
-"""The figure of `benchmark fits`."""
+"""Draws the figure of `benchmark fits`."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def draw_fits(measured: dict[str, Any]) -> bytes:
             for item in measured["fits"]
             if (item["sensing"], item["search"]) == (sensing, search)
         ]
-        # Side by side, so that intervals do not hide each other.
+        # Shift the markers sideways, so that intervals do not hide each other.
         x = [item["clearance_mm"] * 1.03 ** (number - 1.5) for item in found]
         y = [100 * item["strict"] / item["tools"] for item in found]
         ends = [[100 * end for end in item["interval"]] for item in found]

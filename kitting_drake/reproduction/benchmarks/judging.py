@@ -19,24 +19,26 @@ from systems.signals import PickPlaceAction, PlanarPose
 Array = NDArray[np.float64]
 
 _SPACING = 0.002
-"""The distance between points of an outline, in metres."""
+"""The distance between the points of an outline, in metres."""
 _TOUCHED, _HELD = 4e-6, 2e-5
-"""Areas of overlap in square metres, seen from above. A finger touches an object if the two overlap
-by more than the first. The jaws hold an object if more than the second lies between the pads."""
+"""Areas of overlap in square metres, seen from above. A finger touches an object if they overlap by
+more than the first. The jaws hold an object if the part of it between the pads is larger than the
+second."""
 PLACE_OFF = 0.0035
-"""A place is right if 95 % of the outline lies this close to the outline at the goal, in metres."""
+"""The largest distance, in metres, of 95 % of the placed outline from the outline at the goal, for
+a right place."""
 
 
 def judge(action: PickPlaceAction, loose: Sequence[LooseTool]) -> str:
-    """Whether an action seats a tool: `right`, or what is wrong.
+    """Judges whether an action would put a tool into its cavity.
 
     Args:
-        action: pick and place in the world.
-        loose: the tools that belong into a cavity.
+        action: the pick and place, in the world.
+        loose: the tools that are not in their cavities yet.
 
     Returns:
-        `right`, `no tool` (the action picks nothing that belongs into a cavity), `grasp` (the hand
-        cannot hold the tool there), or `place` (the place is wrong).
+        `right`, or what is wrong: `no tool` (the action picks nothing that belongs into a cavity),
+            `grasp` (the hand cannot hold the tool there) or `place` (the place is wrong).
     """
     picked = _picked(action, loose)
     if picked is None:
@@ -53,8 +55,10 @@ def judge(action: PickPlaceAction, loose: Sequence[LooseTool]) -> str:
 
 
 def covering(action: PickPlaceAction, loose: Sequence[LooseTool]) -> list[PlanarPose]:
-    """Picks that cover the tool of an action. A policy that gets them as failed picks takes another
-    tool next."""
+    """Returns picks that cover the tool of an action.
+
+    A policy that gets them as failed picks takes another tool next.
+    """
     picked = _picked(action, loose)
     if picked is None:
         return [action.pick]
@@ -63,7 +67,7 @@ def covering(action: PickPlaceAction, loose: Sequence[LooseTool]) -> list[Planar
 
 
 def _picked(action: PickPlaceAction, loose: Sequence[LooseTool]) -> LooseTool | None:
-    """The tool of which most lies between the open jaws."""
+    """Returns the tool of which the largest part lies between the open jaws; None without one."""
     pick = action.pick
     between = rectangle_at((PAD_LENGTH, MAX_OPENING), pick.x, pick.y, pick.theta)
     held = [(between ^ _placed(item.tool.footprint, item.X_WT)).area() for item in loose]
@@ -73,7 +77,7 @@ def _picked(action: PickPlaceAction, loose: Sequence[LooseTool]) -> LooseTool | 
 
 
 def _is_grasp(action: PickPlaceAction, picked: LooseTool) -> bool:
-    """Whether the open fingers touch nothing."""
+    """Whether the open fingers touch neither the tool nor other objects."""
     pick = action.pick
     outline = _placed(picked.tool.footprint, picked.X_WT)
     side = (MAX_OPENING + FINGERTIP_DEPTH) / 2
@@ -92,7 +96,7 @@ def _placed(footprint: CrossSection, X_W: RigidTransform) -> CrossSection:
 
 
 def _outline(footprint: CrossSection, X_W: RigidTransform) -> Array:
-    """(n, 2): points of the outline at a pose, evenly spread."""
+    """Returns points (n, 2) of the outline at a pose, evenly spread."""
     points = []
     for polygon in _placed(footprint, X_W).to_polygons():
         ends = np.roll(polygon, -1, axis=0)

@@ -1,4 +1,4 @@
-"""`benchmark kits`: building time, clearance and size of the dataset's kits."""
+"""Measures the building time, clearance and size of the dataset's kits (`benchmark kits`)."""
 
 import time
 from typing import Any
@@ -22,13 +22,13 @@ def benchmark_kits(count: int | None, console: Console) -> dict[str, Any]:
 
     Args:
         count: the number of kits of each split; None for all.
-        console: where to show progress.
+        console: the console for the progress.
     """
     build_times, triangles, medians, minima = [], [], [], []
     chosen = [names for split in PAPER_SPLITS for names in toolsets(split)[:count]]
     for names in track(chosen, "kits", console=console, transient=True, disable=console.quiet):
         start = time.perf_counter()
-        # Build from the meshes on disk, without the cache.
+        # Bypass the cache, so that every kit is built from the meshes on disk.
         tools = [load_tool(name) for name in names]
         layout = layout_kit(tools, KitParameters())
         parameters = layout.parameters

@@ -1,4 +1,5 @@
-"""`benchmark reach`: where an arm reaches in a workspace, and the best place for its base."""
+"""Measures where an arm reaches in a workspace, and finds the best place for its base (`benchmark
+reach`)."""
 
 from __future__ import annotations
 
@@ -23,17 +24,17 @@ from systems.arm_reach_map import MARGIN, YAWS, ReachMap
 from systems.signals import PixelGrid
 
 _LEVELS = 4
-"""Number of heights."""
+"""The number of heights at which the reach is measured."""
 _LOWEST = 0.02
-"""The lowest one, above the table, in m."""
+"""The lowest of these heights, above the table, in m."""
 _SPACING, _COARSE = 0.025, 0.10
-"""Distance of the map's points, and of those of the search, in m."""
+"""The spacing of the map's points, and of the points for the search, in m."""
 _AROUND = 0.8
-"""How far from the workspace the search goes, in m."""
+"""The largest distance of a searched base from the workspace, in m."""
 _STEP, _FINER = 0.10, 0.05
-"""Distance of the bases that the search tries, then around the best, in m."""
+"""The spacing of the bases in the first search, and around its best base in the second, in m."""
 _TURNS = (0.0, -45.0, 45.0, 180.0)
-"""Yaws of the base relative to the one that faces the workspace, in degrees."""
+"""The yaws of the base to try, relative to the yaw at which it faces the workspace, in degrees."""
 
 
 @dataclass(frozen=True)
@@ -43,16 +44,16 @@ class _Best:
 
 
 def measure_reach(robot: BenchRobot, grid: PixelGrid, console: Console) -> dict[str, Any]:
-    """Measures a base's reach, and searches for a better one.
+    """Measures the reach from a base, and searches for a better base.
 
     Args:
-        robot: whose base; the search keeps its height.
+        robot: the arm with its base; the search keeps the base's height.
         grid: the workspace.
-        console: shows the progress.
+        console: the console for the progress.
 
     Returns:
-        The content of `reach.json`, in m and degrees. Shares are of positions and yaws, from 0
-        to 1.
+        The content of `reach.json`, in m and degrees. Shares, from 0 to 1, are of all positions and
+        yaws of the hand.
     """
     heights = np.linspace(grid.z_min + _LOWEST, grid.z_max, _LEVELS)
     reach = ReachMap(robot.limits, heights - robot.base.z)
@@ -81,7 +82,7 @@ def _base_record(base: ArmBase) -> dict[str, Any]:
 
 
 def _points(grid: PixelGrid, spacing: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """x and y in the middles of cells of about the spacing."""
+    """Returns the x and the y of the middles of cells whose size is about the spacing."""
 
     def middles(low: float, high: float) -> NDArray[np.float64]:
         count = max(round((high - low) / spacing), 1)
@@ -93,7 +94,7 @@ def _points(grid: PixelGrid, spacing: float) -> tuple[NDArray[np.float64], NDArr
 def _shares(
     reach: ReachMap, base: ArmBase, x: NDArray[np.float64], y: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """(x, y, heights) share of the yaws."""
+    """Returns the share (x, y, heights) of the hand's yaws that the arm reaches."""
     points = np.stack(np.meshgrid(x, y, indexing="ij"), -1)
     return reach.shares(base, points.reshape(-1, 2)).reshape(len(x), len(y), -1)
 
@@ -101,7 +102,11 @@ def _shares(
 def _search(
     reach: ReachMap, given: ArmBase, grid: PixelGrid, console: Console
 ) -> tuple[list[list[float]], _Best]:
-    """All bases that were tried, as x, y, yaw in degrees and share; and the best one."""
+    """Searches for the best base.
+
+    Returns:
+        All bases that were tried, as x, y, yaw in degrees and share; and the best base.
+    """
     coarse, fine = _points(grid, _COARSE), _points(grid, _SPACING)
     tried: list[list[float]] = []
 
@@ -113,7 +118,7 @@ def _search(
     bases = _bases(given, grid)
     places = track(bases, "searching", console=console, transient=True, disable=console.quiet)
     found = [_Best(score(base, coarse), base) for base in places]
-    # Of equally good ones, the farthest: there the joints move less.
+    # Among equally good bases, prefer the farthest one, from which the joints move less.
     middle = (grid.x_min + grid.x_max) / 2, (grid.y_min + grid.y_max) / 2
 
     def order(it: _Best) -> tuple[float, float]:
@@ -133,14 +138,14 @@ def _search(
 
 
 def _is_free(base: ArmBase, grid: PixelGrid) -> bool:
-    """Whether the arm's foot stands beside the workspace."""
+    """Whether the arm's foot stands outside the workspace."""
     dx = max(grid.x_min - base.x, base.x - grid.x_max, 0.0)
     dy = max(grid.y_min - base.y, base.y - grid.y_max, 0.0)
     return math.hypot(dx, dy) >= FOOT
 
 
 def _bases(given: ArmBase, grid: PixelGrid) -> list[ArmBase]:
-    """Bases around the workspace, on multiples of the step."""
+    """Returns the bases to try around the workspace, at multiples of the step."""
 
     def around(low: float, high: float) -> range:
         return range(math.ceil((low - _AROUND) / _STEP), math.floor((high + _AROUND) / _STEP) + 1)
@@ -157,7 +162,7 @@ def _bases(given: ArmBase, grid: PixelGrid) -> list[ArmBase]:
 
 
 def reach_table(measured: dict[str, Any]) -> Table:
-    """The reach of the given base, by height, and of the best base."""
+    """Makes a table of the given base's reach, by height, and of the best base."""
     table = Table(title=f"reach of a {measured['model']}", title_justify="left")
     for heading in ("base x, y, z, m", "yaw, deg", "workspace"):
         table.add_column(heading, justify="right")
@@ -175,7 +180,7 @@ def reach_table(measured: dict[str, Any]) -> Table:
 
 
 def draw_reach(measured: dict[str, Any]) -> bytes:
-    """Draws the reach at each height, and that of all bases tried; returns a PNG."""
+    """Draws the reach at each height, and the reach from all bases that were tried, as a PNG."""
     figure = Figure(figsize=(15, 6.2), layout="constrained", dpi=110)
     mosaic: list[list[Any]] = [[0, 1, "bases"], [2, 3, "bases"]]
     axes = figure.subplot_mosaic(mosaic, width_ratios=[1, 1, 1.9])
@@ -242,7 +247,7 @@ def _draw_bases(axes: Axes, measured: dict[str, Any]) -> None:
 
 
 def _mark(axes: Axes, record: dict[str, Any], colour: str, label: str = "") -> None:
-    """An arrow at a base, along its x."""
+    """Draws an arrow at a base, along its x."""
     (x, y, _), yaw = record["base"], math.radians(record["yaw_deg"])
     axes.plot([y], [x], "o", color=colour, ms=7, label=label or None)
     tip = (y + 0.1 * math.sin(yaw), x + 0.1 * math.cos(yaw))

@@ -1,9 +1,9 @@
-"""`benchmark recovery`: how a policy recovers from a failed action.
+"""Measures how a policy recovers from a failed action (`benchmark recovery`).
 
 The first action of each episode is made to fail in one of three ways: the object is moved while the
-hand comes down, the grasp is off, or the place is off. The benchmark counts how often that object
-is kitted in the end, and how often a kitted object is disturbed again. Undisturbed episodes are the
-baseline.
+hand comes down, the grasp is off, or the place is off. The benchmark counts how often this object
+is in its cavity in the end, and how often an object is disturbed after it was placed. Undisturbed
+episodes are the baseline.
 """
 
 import dataclasses
@@ -36,22 +36,22 @@ from systems.signals import PickPlaceAction, PlanarPose
 from systems.weak_calc import weak_calc
 
 _MOVED = (0.03, 0.06)
-"""Least and largest distance by which an object is moved, in metres."""
+"""The smallest and the largest distance by which an object is moved, in metres."""
 _MOVED_YAW = math.radians(45)
-"""Largest angle by which a moved object is also turned, in radians."""
+"""The largest angle by which a moved object is turned, in radians."""
 _MISSED = 0.04
-"""The error of a grasp, in metres."""
+"""The error of a grasp that is made to fail, in metres."""
 _BLOCKED = 0.003
-"""The error of a place, in metres."""
+"""The error of a place that is made to fail, in metres."""
 _ROOM = 0.012
-"""The least distance of a moved object from all others, in metres."""
+"""The least distance of a moved object from all other objects, in metres."""
 _INSIDE = 0.02
 """The least distance of a moved object from the border of o_t, in metres."""
 _DRAWS = 200
 
 
 class Disturbance(enum.Enum):
-    """The fault of the first action of an episode."""
+    """The way in which the first action of an episode is made to fail."""
 
     NONE = "nothing"
     MOVED = "object moved"
@@ -60,7 +60,7 @@ class Disturbance(enum.Enum):
 
 
 class ActionOffset(LeafSystem):
-    """Shifts the poses of an action.
+    """A LeafSystem that shifts the poses of an action.
 
     .. pydrake_system::
 
@@ -70,14 +70,15 @@ class ActionOffset(LeafSystem):
         output_ports:
         - action
 
-    Both are abstract, `PickPlaceAction`. The numeric parameter 0 holds the shifts of pick x, pick
-    y, place x and place y, in metres. If all are zero, the action passes unchanged.
+    Both ports are abstract, of type `PickPlaceAction`. The numeric parameter 0 has the shifts of
+    pick x, pick y, place x and place y, in metres. If all are zero, the action passes unchanged.
     """
 
     def __init__(self, offset: NDArray[np.float64]) -> None:
-        """
+        """Declares the ports and the parameter.
+
         Args:
-            offset: (4,), the initial value of the parameter.
+            offset: (4,) the initial value of the parameter.
         """
         super().__init__()
         self._action = self.DeclareAbstractInputPort("action", Value(PickPlaceAction()))
@@ -110,7 +111,7 @@ def _shifted(pose: PlanarPose, offset: NDArray[np.float64]) -> PlanarPose:
 
 
 class _Adversary:
-    """An `EpisodeObserver` that causes a disturbance and counts disturbed kitted objects."""
+    """An `EpisodeObserver` that makes the first action fail, and counts disturbed objects."""
 
     def __init__(
         self,
@@ -126,9 +127,9 @@ class _Adversary:
         self.victim: int | None = None
         """The object whose action fails; None if no disturbance was possible."""
         self.seated: set[int] = set()
-        """The objects that were kitted when an action began."""
+        """The objects that were in their cavities when an action began."""
         self.touched: set[int] = set()
-        """The kitted objects that an action then picked."""
+        """The objects that an action picked although they were in their cavities."""
 
     def observe(self, event: ModeChange) -> None:
         if event.is_last:
@@ -207,9 +208,9 @@ class _Count:
     seated: int = 0
     actions: int = 0
     failed: int = 0
-    """Failed episodes; none of their objects counts as kitted."""
+    """The number of failed episodes. All of their objects count as not placed."""
     timed_out: int = 0
-    """Timed-out episodes; none of their objects counts as kitted either."""
+    """The number of episodes that timed out. All of their objects count as not placed."""
 
 
 def benchmark_recovery(
@@ -219,13 +220,13 @@ def benchmark_recovery(
 
     Args:
         chosen: the scenario with the tested policy.
-        episodes: the number with each disturbance.
-        seed: the seed of the first episode; the others follow.
-        console: where to show progress.
+        episodes: the number of episodes with each disturbance.
+        seed: the first seed; the others follow.
+        console: the console for the progress.
 
     Returns:
         The counts, and a PNG with the frames of one episode per disturbance: the one that recovered
-        with the most actions.
+            with the most actions.
 
     Raises:
         UserError: the scenario has no cameras for the frames, or the scene of a seed cannot be
@@ -233,7 +234,7 @@ def benchmark_recovery(
     """
     if not chosen.scenario.cameras:
         raise UserError(
-            f"{chosen.path}: cameras is empty: the frames of episodes need at least one camera"
+            f"{chosen.path}: cameras is empty, and the frames of episodes need at least one camera"
         )
     counts = {kind: _Count() for kind in Disturbance}
     strips: dict[Disturbance, _Strip] = {}
@@ -254,7 +255,7 @@ def benchmark_recovery(
 def _build(
     chosen: ChosenScenario, seed: int, shift: NDArray[np.float64]
 ) -> tuple[Diagram, KittingStation, ActionOffset]:
-    """A station whose policy's actions go through an `ActionOffset`."""
+    """Builds a station whose policy's actions pass through an `ActionOffset`."""
     builder = DiagramBuilder()
     with chosen.named_in_errors():
         station = builder.AddSystem(build_station(chosen.scenario, seed, chosen.base))
@@ -265,7 +266,7 @@ def _build(
 
 
 def _run(chosen: ChosenScenario, kind: Disturbance, seed: int, count: _Count) -> _Strip | None:
-    """Runs an episode and counts its outcome; returns its frames if everything was kitted."""
+    """Runs an episode and counts its outcome; returns its frames if all objects were placed."""
     rng = np.random.default_rng([seed, list(Disturbance).index(kind)])
     way = rng.uniform(0, math.tau)
     direction = np.array([math.cos(way), math.sin(way)])
@@ -299,7 +300,7 @@ def _run(chosen: ChosenScenario, kind: Disturbance, seed: int, count: _Count) ->
 
 
 def recovery_table(measured: dict[str, Any]) -> Table:
-    """The measurements as a table for the terminal."""
+    """Makes a table of the measurements."""
     table = Table(title=f"{measured['policy']['name']}: {measured['episodes']} episodes each")
     columns = ("recovered", "kitted in all", "disturbed again", "actions", "failed, timed out")
     table.add_column("the first action")

@@ -1,6 +1,6 @@
-"""How reliable the confidence of a decision is, on drawn scenes with random cameras.
+"""Measures how reliable the confidence of decisions is, on drawn scenes with random cameras.
 
-Scenes are drawn as for training, from seeds that no training uses. Decisions are judged by geometry
+Scenes are drawn as for training, with seeds that no training uses. Decisions are judged by geometry
 (`judging`), without physics.
 """
 
@@ -44,17 +44,19 @@ _CAMERAS = {
     "two or three": (2, 3),
 }
 _RANDOM_VIEWS = 0.7
-"""The share of scenes with random cameras; the others have the default cameras."""
+"""The share of scenes with random cameras. The other scenes have the default cameras."""
 _EVERY = 4
-"""Of the scenes of a seed, which share their tools, every fourth is used."""
+"""The stride between used scenes of a seed; the scenes of a seed share their tools."""
 _WITHOUT_KIT = 0.1
 """The share of scenes without a kit."""
 _DECISIONS = 3
-"""The most decisions of a policy in a scene; each avoids the tools of earlier decisions."""
+"""The largest number of decisions of a policy in a scene. Each avoids the tools of the earlier
+ones."""
 _MOST_WRONG = 0.02
 """The largest share of wrong decisions among those above the threshold."""
 _FOLDS, _FOLD = 6, 10
-"""The number of parts in cross-validation, and how many successive scenes stay together."""
+"""The number of parts in the cross-validation, and the number of successive scenes that stay in one
+part."""
 _BINS = 10
 _SHRINKAGE = 1e-3
 """The weight of the squared coefficients in the fit."""
@@ -62,18 +64,18 @@ _SHRINKAGE = 1e-3
 
 @dataclass(frozen=True)
 class Judged:
-    """A decision to act, or a refusal."""
+    """A decision of a policy, with the verdict on it."""
 
     policy: str
-    """`networks` or `shape_matching`."""
+    """The policy: `networks` or `shape_matching`."""
     scene: int
     verdict: str
     """The result of `judge`; `stop` if the policy did not act."""
     evidence: Evidence
     cameras: int
-    """Their number; zero for the default ones."""
+    """The number of random cameras; zero for the default cameras."""
     reason: str = ""
-    """Why the policy stopped."""
+    """The reason why the policy stopped."""
 
 
 def measure_reliability(
@@ -85,18 +87,18 @@ def measure_reliability(
     *,
     fits: bool,
 ) -> dict[str, Any]:
-    """Measures how reliable the confidence is.
+    """Measures how reliable the confidence of decisions is.
 
     Args:
-        first_seed: of the scenes.
+        first_seed: the seed of the first scene.
         count: the number of scenes.
-        weights: of the networks; None for the generalist.
-        folder: gets `decisions.jsonl`, and `confidence.json` if `fits`.
-        console: for the progress bar.
+        weights: the file of the networks; None for the generalist.
+        folder: the folder for `decisions.jsonl`, and for `confidence.json` if `fits`.
+        console: the console for the progress.
         fits: whether to fit the confidence to these decisions, instead of using the fitted one.
 
     Returns:
-        A summary of each policy's decisions, by the cameras.
+        A summary of each policy's decisions, by the number of cameras.
     """
     judged: list[Judged] = []
     with counting_bar(console, "scenes") as progress:
@@ -114,13 +116,13 @@ def measure_reliability(
 def summarize_all(
     judged: list[Judged], weights: Path | None, fitted: Path | None
 ) -> dict[str, Any]:
-    """Summaries by policy and cameras.
+    """Summarizes decisions by policy and number of cameras.
 
     Args:
         judged: all decisions.
-        weights: of the networks; None for the generalist.
-        fitted: the folder for `confidence.json`, fitted to these decisions; None to use the one
-            that is fitted already.
+        weights: the file of the networks; None for the generalist.
+        fitted: the folder in which to write `confidence.json`, fitted to these decisions; None uses
+            the confidence that is fitted already.
     """
     found, summaries = {}, {}
     for policy in POLICIES:
@@ -152,7 +154,7 @@ def _confidence(reliability: Reliability, item: Judged) -> float:
 
 
 def _cross_validated(judged: list[Judged]) -> list[float]:
-    """The confidences of decisions, each by a regression that was fitted to the other scenes."""
+    """Returns the confidence of each decision by a regression that was fitted to other scenes."""
     confidences = [0.0] * len(judged)
     for fold in range(_FOLDS):
         inside = [item.scene // _FOLD % _FOLDS == fold for item in judged]
@@ -169,7 +171,7 @@ def draw_judged(first_seed: int, count: int, weights: Path | None = None) -> Ite
     Args:
         first_seed: the seed of the first scene.
         count: the number of scenes.
-        weights: of the networks; None for the generalist.
+        weights: the file of the networks; None for the generalist.
     """
     planner = PickPlaceParameters()
     networks = load_learned_policy(weights, planner, insertion=True).function
@@ -200,7 +202,7 @@ def draw_judged(first_seed: int, count: int, weights: Path | None = None) -> Ite
 
 
 def _scenes(first_seed: int) -> Iterator[DrawnScene]:
-    """Scenes of successive seeds, some without their kit."""
+    """Yields scenes of successive seeds, some of them without their kit."""
     seed = first_seed
     while True:
         rng = np.random.default_rng([seed, 3])
@@ -211,14 +213,14 @@ def _scenes(first_seed: int) -> Iterator[DrawnScene]:
             if rng.random() >= _RANDOM_VIEWS:
                 scene = replace(scene, cameras=dict(Scenario().cameras))
             if rng.random() < _WITHOUT_KIT:
-                # The kit is the first body. Without it, no tool has a goal.
+                # The first body is the kit. Without it, no tool has a goal.
                 scene = replace(scene, bodies=scene.bodies[1:], loose=())
             yield scene
         seed += 1
 
 
 def _draw_noise(rng: np.random.Generator) -> SensorNoiseParameters:
-    """The errors of a camera that was calibrated to a millimetre and a tenth of a degree."""
+    """Draws errors of a camera that was calibrated to a millimetre and a tenth of a degree."""
     if rng.random() < 0.3:
         return SensorNoiseParameters()
     share = rng.uniform(0.0, 1.0, 7)
@@ -236,7 +238,7 @@ def _draw_noise(rng: np.random.Generator) -> SensorNoiseParameters:
 
 
 def fit(judged: list[Judged]) -> Reliability:
-    """Fits the regression of one policy; its threshold is 0."""
+    """Fits the regression of one policy, with a threshold of 0."""
     acted = [item for item in judged if item.verdict != "stop"]
     names = sorted(acted[0].evidence)
     facts = np.array([[item.evidence[name] for name in names] for item in acted])
@@ -260,7 +262,7 @@ def fit(judged: list[Judged]) -> Reliability:
 
 
 def _threshold(judged: list[Judged], confidences: list[float]) -> float:
-    """The least threshold above which at most `_MOST_WRONG` of the decisions are wrong."""
+    """Returns the least threshold above which at most `_MOST_WRONG` of the decisions are wrong."""
     acted = [k for k, item in enumerate(judged) if item.verdict != "stop"]
     confidence = np.array([confidences[k] for k in acted])
     right = np.array([judged[k].verdict == "right" for k in acted])
@@ -272,29 +274,30 @@ def _threshold(judged: list[Judged], confidences: list[float]) -> float:
 
 @dataclass(frozen=True)
 class ReliabilitySummary:
-    """How well a confidence tells right from wrong."""
+    """Measures of how well a confidence separates right decisions from wrong ones."""
 
     decisions: int
     right: float
-    """The share of right decisions."""
+    """The share of right decisions among all."""
     calibration_error: float
     """The expected calibration error over ten bins."""
     wrong_answers: float
     """The share of wrong decisions among those above the threshold."""
     refused: float
-    """The share of right decisions below the threshold."""
+    """The share of right decisions that are below the threshold."""
     bins: list[tuple[float, float, int]]
-    """Mean confidence, share of right decisions and number of decisions."""
+    """For each bin: the mean confidence, the share of right decisions and the number of
+    decisions."""
 
 
 def summarize(
     judged: list[Judged], confidences: list[float], threshold: float
 ) -> ReliabilitySummary:
-    """Summarizes decisions.
+    """Summarizes the decisions of one policy.
 
     Args:
-        judged: the decisions, of one policy.
-        confidences: those of the decisions, from 0 to 1.
+        judged: the decisions.
+        confidences: the confidence of each decision, from 0 to 1.
         threshold: the least confidence with which to act.
     """
     acted = [k for k, item in enumerate(judged) if item.verdict != "stop"]
@@ -320,6 +323,6 @@ def summarize(
 
 
 def as_lines(judged: Iterable[Judged]) -> Iterator[str]:
-    """Decisions as lines of JSON."""
+    """Yields decisions as lines of JSON."""
     for item in judged:
         yield json.dumps(item.__dict__)

@@ -1,4 +1,4 @@
-"""The table and the diagram of `benchmark reliability`."""
+"""Makes the table and the diagram of `benchmark reliability`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _COLOURS = {"networks": "#e4572e", "shape_matching": "#1b998b"}
 
 
 def reliability_table(measured: dict[str, Any]) -> Table:
-    """A row for each policy and group of cameras."""
+    """Makes a table with a row for each policy and number of cameras."""
     table = Table(title="confidence of decisions", title_justify="left")
     for heading in ("policy", "cameras"):
         table.add_column(heading)
@@ -37,11 +37,7 @@ def reliability_table(measured: dict[str, Any]) -> Table:
 
 
 def draw_reliability(measured: dict[str, Any]) -> bytes:
-    """Draws the share of right decisions over their confidence, with their numbers.
-
-    Returns:
-        A PNG.
-    """
+    """Draws the share of right decisions over their confidence, with the numbers of decisions."""
     figure = Figure(figsize=(8, 4.4), layout="constrained", dpi=130)
     for axes, (policy, name) in zip(
         figure.subplots(1, 2, sharey=True), _NAMES.items(), strict=True

@@ -1,4 +1,4 @@
-"""Releases tools in MuJoCo at the poses where Drake released them, and compares the verdicts."""
+"""Releases tools in MuJoCo at the poses at which Drake released them, and compares the outcomes."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,41 +25,45 @@ from systems.placement import Placement, evaluate_placements
 
 _TIME_STEP = 0.001
 _REST = 2.0
-"""The time for a tool to fall and come to rest, in s."""
+"""The time in which a tool falls and comes to rest, in s."""
 _CONTACT_TIME = 0.004
-"""MuJoCo's time constant of contact, in s: stiff, but at least twice the step."""
+"""MuJoCo's time constant of contact, in s. It is short, for stiff contact, but must be at least
+twice the time step."""
 _FRICTION = 0.375
-"""The harmonic mean of a tool's 0.5 and a kit's 0.3, as in Drake; MuJoCo would take 0.5."""
+"""The friction between tool and kit: the harmonic mean of 0.5 and 0.3, as in Drake. MuJoCo would
+use the larger one."""
 
 _MOST_FRUITLESS = 5
-"""The benchmark fails after this many episodes in a row without a release."""
+"""The number of episodes in a row without a release after which the benchmark fails."""
 
 
 @dataclass(frozen=True)
 class Release:
-    """A tool when the jaws begin to open, and its station."""
+    """A tool at the moment when the jaws begin to open, and its station."""
 
     station: KittingStation
     index: int
-    """The index of the object."""
+    """The index of the object in the scene."""
     X_WB: RigidTransform
 
 
 def ask_mujoco(
     placements: int, seed: int, orientations: int | None, console: Console
 ) -> dict[str, Any]:
-    """Releases tools in MuJoCo at the poses where oracles on unseen toolsets release them in Drake.
+    """Releases tools in MuJoCo at the poses at which oracles release them in Drake.
 
-    The MuJoCo scene has no hand: only the table, the kit and the tool at rest.
+    The tools are from unseen toolsets. The MuJoCo scene has no hand, only the table, the kit and
+    the tool at rest.
 
     Args:
-        placements: how many to compare.
+        placements: the number of releases to compare.
         seed: the seed of the first episode.
-        orientations: those of a quantized oracle, which misses more often; None for the oracle.
-        console: where to show the progress bar.
+        orientations: the number of orientations of a quantized oracle, which misses more often;
+            None for the exact oracle.
+        console: the console for the progress bar.
 
     Returns:
-        The record of `benchmark mujoco`: the share of equal verdicts, and each placement.
+        The record of `benchmark mujoco`: the share of equal outcomes, and each placement.
 
     Raises:
         UserError: the package mujoco is not installed, or the oracle releases nothing.
@@ -74,7 +78,7 @@ def ask_mujoco(
             fruitless = 0 if witness.releases else fruitless + 1
             if fruitless == _MOST_FRUITLESS:
                 raise UserError(
-                    f"nothing was released in {fruitless} episodes: raise --orientations"
+                    f"no tool was released in {fruitless} episodes: raise --orientations"
                 )
             for release in witness.releases.values():
                 rows.append(_row(seed, witness, release, _fall(mujoco, release)))
@@ -97,7 +101,7 @@ def ask_mujoco(
 
 
 class _Witness:
-    """An `EpisodeObserver` that records where tools are released and where they end."""
+    """An `EpisodeObserver` that records where tools are released, and where they end."""
 
     def __init__(self, station: KittingStation) -> None:
         self._station = station
@@ -107,7 +111,7 @@ class _Witness:
         self.placements: list[Placement] = []
 
     def observe(self, event: ModeChange) -> None:
-        """Records a release, and the end of the episode."""
+        """Records a release, or the end of the episode."""
         station = self._station
         poses = station.object_poses(event.root_context)
         if event.is_last:
@@ -134,7 +138,7 @@ def _episode(seed: int, orientations: int | None) -> _Witness:
 def _row(seed: int, witness: _Witness, release: Release, X_WB: RigidTransform) -> dict[str, Any]:
     """Compares a placement in Drake with the object's pose X_WB in MuJoCo.
 
-    The latter is scored with all other objects at their final poses in Drake.
+    The pose in MuJoCo is scored with all other objects at their final poses in Drake.
     """
     station, index = release.station, release.index
     poses = list(witness.final_poses)
@@ -164,7 +168,7 @@ def _verdict(placement: Placement) -> dict[str, Any]:
 
 
 def _fall(mujoco: Any, release: Release) -> RigidTransform:
-    """X_WB of a released tool at rest in MuJoCo."""
+    """Returns X_WB of a released tool at rest in MuJoCo."""
     scene = release.station.scene
     item = scene.objects[release.index]
     world = mujoco.MjSpec()
@@ -174,7 +178,7 @@ def _fall(mujoco: Any, release: Release) -> RigidTransform:
     for number, fixture in enumerate(scene.fixtures):
         kit = _spec(mujoco, kit_mjcf(fixture.model), fixture.model.parent)
         for geom in kit.geoms:
-            # With priority, the kit's friction applies instead of the tool's.
+            # Give the kit priority, so that its friction is used instead of the tool's.
             geom.priority, geom.friction[0] = 1, _FRICTION
         _attach(world, kit, fixture.X_WF, f"fixture_{number}_")
     tool = _spec(mujoco, tool_mjcf(item.model), item.model.parent)
@@ -196,14 +200,14 @@ def _spec(mujoco: Any, text: str, folder: Path) -> Any:
 
 
 def _attach(world: Any, spec: Any, X_WF: RigidTransform, prefix: str) -> None:
-    """Attaches a model to the world at a pose."""
+    """Attaches a model to the world, with its frame F at X_WF."""
     quaternion = X_WF.rotation().ToQuaternion().wxyz()
     frame = world.worldbody.add_frame(pos=X_WF.translation(), quat=quaternion)
     world.attach(spec, prefix=prefix, frame=frame)
 
 
 def opinion_table(measured: dict[str, Any]) -> Table:
-    """The verdicts in Drake and in MuJoCo, as a table for the terminal."""
+    """Makes a table of the outcomes in Drake and in MuJoCo."""
     table = Table(title=f"{measured['placements']} placements of the {measured['policy']}")
     for heading in ("measure", "yes here", "yes in MuJoCo", "alike"):
         table.add_column(heading, justify="left" if heading == "measure" else "right")

@@ -1,4 +1,5 @@
-"""`benchmark simulation`: the time of episodes by phase, of starting up, and of images."""
+"""Measures the time of episodes by phase, of starting up, and of images (`benchmark
+simulation`)."""
 
 import os
 import platform
@@ -33,11 +34,11 @@ def benchmark_simulation(episodes: int, seed: int, console: Console) -> dict[str
     """Runs all measurements of `benchmark simulation`.
 
     Args:
-        episodes: the number of episodes of each of the oracle and the learned policy.
-        seed: the seed of the first episode; the others follow.
-        console: where to show progress.
+        episodes: the number of episodes for the oracle, and the same number for the learned policy.
+        seed: the first seed; the others follow.
+        console: the console for the progress.
     """
-    # Set before PyTorch is loaded: one thread, as for each worker of `evaluate`.
+    # Limit PyTorch to one thread before it is loaded, as for each worker of `evaluate`.
     os.environ["OMP_NUM_THREADS"] = "1"
     stopwatch = PhaseStopwatch()
     return {
@@ -65,7 +66,8 @@ def benchmark_simulation(episodes: int, seed: int, console: Console) -> dict[str
 def _whole_episodes(
     path: Path, episodes: int, seed: int, stopwatch: "PhaseStopwatch", console: Console
 ) -> dict[str, Any]:
-    """Runs whole episodes; returns the cost per kitted object, without building the stations."""
+    """Runs whole episodes; returns the cost per placed object, without the time to build
+    stations."""
     scenario = load_scenario(path)
     simulated = wall = kitted = 0.0
     for number in track(
@@ -94,7 +96,7 @@ def _whole_episodes(
 
 
 def _require_whole(result: EpisodeResult) -> None:
-    """Raises UserError for an episode that failed or timed out and cannot be measured."""
+    """Raises UserError for an episode that cannot be measured, because it failed or timed out."""
     if result.failure or result.timed_out:
         reason = result.failure or "timed out"
         raise UserError(
@@ -103,11 +105,11 @@ def _require_whole(result: EpisodeResult) -> None:
 
 
 class PhaseStopwatch:
-    """Sums simulated and wall time by the planner's mode, over episodes."""
+    """Sums simulated and wall time over episodes, by the planner's mode."""
 
     def __init__(self) -> None:
         self.phases: dict[str, tuple[float, float]] = {}
-        """Simulated and wall time by mode, in s."""
+        """The simulated and the wall time of each mode, in s."""
         self._last = (0.0, 0.0)
 
     def start(self) -> None:
@@ -115,7 +117,7 @@ class PhaseStopwatch:
         self._last = (0.0, time.perf_counter())
 
     def observe(self, event: ModeChange) -> None:
-        """Adds the time since the last event to the previous mode; an `EpisodeObserver`."""
+        """Adds the time since the last event to the previous mode. It is an `EpisodeObserver`."""
         now = (event.root_context.get_time(), time.perf_counter())
         name = event.previous.name.lower()
         simulated, wall = self.phases.get(name, (0.0, 0.0))
@@ -124,7 +126,7 @@ class PhaseStopwatch:
 
 
 def _start_up_times() -> dict[str, float]:
-    """The wall times of short runs from the shell, including Meshcat and files."""
+    """Returns the wall times of short runs from the shell, including Meshcat and files, in s."""
     times = {}
     with tempfile.TemporaryDirectory() as folder:
         # The first run fills the cache for the second.
@@ -139,10 +141,10 @@ def _start_up_times() -> dict[str, float]:
 
 
 def _image_times(scenario: Scenario, seed: int) -> dict[str, float]:
-    """The times of one RGB-D image, and of the heightmap from all cameras' images.
+    """Returns the times of one RGB-D image, and of the heightmap from all cameras' images, in s.
 
     Raises:
-        UserError: images cannot be rendered here.
+        UserError: images cannot be rendered on this machine.
     """
     require_rendering()
     station = build_station(scenario, seed, SCENARIOS)
@@ -158,11 +160,11 @@ def _image_times(scenario: Scenario, seed: int) -> dict[str, float]:
 
     render_times, project_times = [], []
     for second in range(6):
-        # A new time invalidates the rendered images.
+        # Change the time, which invalidates the rendered images.
         context.SetTime(float(second + 1))
         render_times.append(_timed(render))
         project_times.append(_timed(project))
-    # The first image loads the meshes, so it does not count.
+    # Skip the first image, because it loads the meshes.
     return {
         "rgbd_image": float(np.median(render_times[1:])) / len(scenario.cameras),
         "heightmap": float(np.median(project_times[1:])),
@@ -176,7 +178,7 @@ def _timed(function: Callable[[], None]) -> float:
 
 
 def simulation_tables(measured: dict[str, Any]) -> list[Table]:
-    """The measurements as tables for the terminal."""
+    """Makes tables of the measurements."""
     whole = numbers_table(
         "whole episodes, one thread",
         "policy",

@@ -1,4 +1,5 @@
-"""`benchmark trace`: the error of outlines that are traced from drawn photos of known tools."""
+"""Measures the error of outlines that are traced from drawn photos of known tools (`benchmark
+trace`)."""
 
 import math
 import tempfile
@@ -34,7 +35,7 @@ TOOLS = (
     *("circlip_pliers", "end_nippers", "flat_screwdriver", "locking_pliers", "nut_driver"),
     *("s_wrench", "tack_hammer"),
 )
-"""The first ten were looked at while the tracer was written; the others were not."""
+"""The tools in the photos. The tracer was developed with the first ten; the others are unseen."""
 HEIGHTS_MM = (5.0, 12.0, 20.0)
 TILTS = (4.0, 15.0, 25.0)
 _SAMPLE_MM = 0.25
@@ -48,10 +49,10 @@ def benchmark_trace(
     """Draws three photos of each tool, traces them and measures the outlines, in mm.
 
     Args:
-        names: of the tools.
-        console: where to show progress.
-        folder: where to keep photos and pictures; None: nowhere.
-        exif: whether the photos tell their focal length.
+        names: the names of the tools.
+        console: the console for the progress.
+        folder: the folder in which to keep photos and pictures; None keeps none.
+        exif: whether the photos state their focal length.
     """
     photos, pooled = [], []
     jobs = [(name, k) for name in names for k in range(3)]
@@ -88,7 +89,10 @@ def benchmark_trace(
 
 
 def drawn_case(name: str, index: int, k: int, exif: bool) -> tuple[PhotoSpec, PlacedTool]:
-    """The k-th photo of a tool: three heights and tilts, both grounds, light from all sides."""
+    """Draws the conditions of the k-th photo of a tool.
+
+    They cover three heights and tilts, both grounds, and light from all sides.
+    """
     rng = np.random.default_rng(1000 + index)
     lamp = rng.uniform(0, 2 * math.pi)
     length = rng.uniform(0.2, 0.8)
@@ -120,7 +124,10 @@ def drawn_case(name: str, index: int, k: int, exif: bool) -> tuple[PhotoSpec, Pl
 
 
 def outline_errors(traced: CrossSection, true: CrossSection) -> Points:
-    """Distances (n,) of points on each outline from the other, laid over each other, in mm."""
+    """Returns the distances (n,) of points on each outline from the other, in mm.
+
+    The outlines are first moved onto each other.
+    """
     from_points, to_points = _samples(traced), _samples(true)
     best: Points | None = None
     for quarter in range(4):
@@ -135,7 +142,7 @@ def outline_errors(traced: CrossSection, true: CrossSection) -> Points:
 
 
 def _samples(outline: CrossSection) -> Points:
-    """Points (n, 2) at even distances along an outline, about its centre."""
+    """Returns points (n, 2) at even distances along an outline, relative to its centre."""
     result = []
     for loop in outline.to_polygons():
         closed = np.concatenate([loop, loop[:1]])
@@ -153,7 +160,7 @@ def _turned(points: Points, angle: float) -> Points:
 
 
 def _registered(points: Points, target: Points) -> Points:
-    """Points moved rigidly onto a target, by their nearest neighbours."""
+    """Moves points (n, 2) rigidly onto a target, by their nearest neighbours."""
     tree = cKDTree(target)
     for _ in range(25):
         _, nearest = tree.query(points)
@@ -167,7 +174,8 @@ def _registered(points: Points, target: Points) -> Points:
 
 
 def _length(outline: CrossSection) -> float:
-    """The largest extent in any direction, by half degrees."""
+    """Returns the largest extent of an outline in any direction, searched in steps of half a
+    degree."""
     points = _samples(outline)
     angles = np.radians(np.arange(0, 180, 0.5))
     return float(np.ptp(points @ np.stack([np.cos(angles), np.sin(angles)]), axis=0).max())
@@ -191,7 +199,7 @@ def _summary(photos: list[dict[str, Any]], pooled: list[Points]) -> dict[str, An
 
 
 def trace_table(measured: dict[str, Any]) -> Table:
-    """The measurements as a table for the terminal."""
+    """Makes a table of the measurements."""
     photos = measured["photos"]
     table = numbers_table(f"{len(photos)} photos of 12 megapixels", "what", "measured")
     table.add_row("traced, refused", f"{measured['traced']}, {len(photos) - measured['traced']}")

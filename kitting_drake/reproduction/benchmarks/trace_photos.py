@@ -1,8 +1,10 @@
-"""Draws photos of tools of known outline on a sheet of paper, for `benchmark trace` and the tests.
+"""Draws photos of tools with known outlines on a sheet of paper, for `benchmark trace` and the
+tests.
 
-A tool is an upright prism over its outline, drawn through a tilted pinhole camera with its walls,
-a soft shadow, texture, highlights, blur, noise and JPEG. Lengths are in mm. The sheet's frame has
-its origin in the sheet's lower left corner, x to the right, y up and z towards the camera.
+A tool is an upright prism over its outline. It is drawn through a tilted pinhole camera with its
+walls, a soft shadow, texture, highlights, blur, noise and JPEG compression. Lengths are in mm. The
+sheet's frame has its origin in the sheet's lower left corner, x to the right, y up and z toward the
+camera.
 """
 
 import io
@@ -34,16 +36,16 @@ PAINTS = {
     "wood": (0.45, 0.26, 0.12),
     "blue": (0.02, 0.08, 0.35),
 }
-"""Linear reflectances."""
+"""Linear reflectances (red, green, blue) of paints, by name."""
 GROUNDS = {"dark": (0.16, 0.10, 0.06), "light": (0.55, 0.50, 0.43)}
 
 
 @dataclass(frozen=True)
 class PhotoSpec:
-    """How a photo is taken."""
+    """The conditions under which a photo is taken."""
 
     size: tuple[int, int] = (4000, 3000)
-    """Width and height, in pixels."""
+    """The width and height, in pixels."""
     sheet: tuple[float, float] = (297.0, 210.0)
     """The size of the sheet along x and y."""
     distance: float = 430.0
@@ -51,41 +53,41 @@ class PhotoSpec:
     tilt: float = 0.0
     """The angle between the line of sight and the vertical, in degrees."""
     azimuth: float = 0.0
-    """The direction that the camera is tilted to, in degrees."""
+    """The direction toward which the camera is tilted, in degrees."""
     roll: float = 0.0
-    """The turn about the line of sight, in degrees."""
+    """The rotation about the line of sight, in degrees."""
     ground: str = "dark"
-    """A key of `GROUNDS`."""
+    """The ground, a key of `GROUNDS`."""
     shadow: float = 0.5
-    """The share of the light that the tool takes away."""
+    """The share of the light that a shadow takes away."""
     light: tuple[float, float] = (0.7, 0.4)
-    """The shift of a shadow along x and y, per height."""
+    """The shift of a shadow along x and y per unit of height."""
     softness: float = 0.15
-    """The spread of `light`."""
+    """The spread of `light`, which makes shadows soft."""
     falloff: float = 0.25
     """The loss of light from one side of the sheet to the other."""
     blur: float = 1.0
     """The standard deviation of the blur, in pixels."""
     noise: float = 0.006
-    """The standard deviation of the noise; values are from 0 to 1."""
+    """The standard deviation of the noise, for values from 0 to 1."""
     quality: int = 90
-    """The quality of the JPEG."""
+    """The quality of the JPEG, from 1 to 100."""
     distortion: float = 0.0
-    """k1 of the lens, in OpenCV's model."""
+    """The coefficient k1 of the lens's distortion, in OpenCV's model."""
     exif: bool = True
-    """Whether the photo tells its focal length."""
+    """Whether the photo states its focal length in its EXIF data."""
     seed: int = 0
 
 
 @dataclass(frozen=True)
 class PlacedTool:
-    """A prism on the sheet."""
+    """A prism on the sheet: a tool with its paints."""
 
     outline: CrossSection
-    """In the sheet's frame."""
+    """The outline in the sheet's frame, in mm."""
     height: float
     paints: tuple[str, str] = ("steel", "red")
-    """Keys of `PAINTS`, of the tool's two ends."""
+    """The paints of the tool's two ends, keys of `PAINTS`."""
 
 
 @dataclass(frozen=True)
@@ -93,9 +95,9 @@ class PlacedPrint:
     """A printed picture on the sheet."""
 
     pixels: Array
-    """(rows, columns) gray."""
+    """The gray pixels (rows, columns) of the picture."""
     low: tuple[float, float]
-    """The lower left corner."""
+    """The lower left corner (x, y) in the sheet's frame, in mm."""
     size: tuple[float, float]
 
 
@@ -106,12 +108,12 @@ class _Camera:
     C: Array
 
     def project(self, points: Array) -> Array:
-        """Pixels (n, 2) of points (n, 3)."""
+        """Projects points (n, 3) to pixels (n, 2)."""
         seen = (np.asarray(points, float) - self.C) @ (self.K @ self.R).T
         return seen[:, :2] / seen[:, 2:]
 
     def homography(self, z: float) -> Array:
-        """From the plane at height z to pixels."""
+        """Returns the homography (3, 3) from the plane at height z to pixels."""
         M = self.K @ self.R
         return np.column_stack([M[:, 0], M[:, 1], M @ (np.array([0, 0, z]) - self.C)])
 
@@ -119,7 +121,7 @@ class _Camera:
 def draw_photo(
     tools: list[PlacedTool], spec: PhotoSpec, printed: PlacedPrint | None = None
 ) -> bytes:
-    """A photo of tools on a sheet, as a JPEG."""
+    """Draws a photo of tools on a sheet, as a JPEG."""
     cv2 = import_extra("cv2", purpose="benchmark trace", extra="camera")
     rng = np.random.default_rng(spec.seed)
     camera = _camera(spec)
@@ -133,7 +135,7 @@ def draw_photo(
         picture = _distorted(cv2, picture, camera, spec)
     picture = cv2.GaussianBlur(picture, (0, 0), spec.blur)
     coded = _srgb(picture)
-    # One draw of noise for small tiles is as good as one for all pixels, and faster.
+    # Draw noise for small tiles, which is faster than for all pixels and looks the same.
     noise = rng.normal(0, spec.noise, (701, 997, 3)).astype(np.float32)
     rows = -(-coded.shape[0] // 701)
     columns = -(-coded.shape[1] // 997)
@@ -169,9 +171,9 @@ def _camera(spec: PhotoSpec) -> _Camera:
 
 
 def _ground(cv2: Any, camera: _Camera, spec: PhotoSpec, rng: np.random.Generator) -> Array:
-    """The desk and the sheet, as linear values."""
+    """Draws the desk and the sheet, as linear values."""
     base = np.array(GROUNDS[spec.ground], np.float32)
-    # A plank with a grain along x, and specks.
+    # Draw a plank with a grain along x, and specks.
     px_per_mm, reach = 2.0, 450.0
     side = int(2 * reach * px_per_mm)
     grain = cv2.GaussianBlur(rng.normal(0, 1, (side, side)).astype(np.float32), (0, 0), 25, None, 2)
@@ -192,7 +194,7 @@ def _ground(cv2: Any, camera: _Camera, spec: PhotoSpec, rng: np.random.Generator
 
 
 def _light_on_ground(cv2: Any, tools: list[PlacedTool], camera: _Camera, spec: PhotoSpec) -> Array:
-    """The share of light that reaches the ground at each pixel."""
+    """Returns the share of light that reaches the ground at each pixel."""
     low = np.full(2, -_SHADOW_MARGIN_MM)
     columns, rows = ((np.array(spec.sheet) - 2 * low) * _SHADOW_PX_PER_MM).astype(int).tolist()
     hidden = np.zeros((rows, columns), np.float32)
@@ -212,7 +214,7 @@ def _light_on_ground(cv2: Any, tools: list[PlacedTool], camera: _Camera, spec: P
     to_plane = np.array(
         [[1 / _SHADOW_PX_PER_MM, 0, low[0]], [0, 1 / _SHADOW_PX_PER_MM, low[1]], [0, 0, 1.0]]
     )
-    # Close to the tool, ambient light is also blocked.
+    # Block some of the ambient light close to the tool.
     near = cv2.GaussianBlur((hidden > 0.9).astype(np.float32), (0, 0), 3 * _SHADOW_PX_PER_MM)
     light = (1 - spec.shadow * hidden) * (1 - 0.25 * near)
     across = np.linspace(-1, 1, columns, dtype=np.float32)
@@ -257,7 +259,7 @@ def _paint_tool(
     low = np.maximum(np.floor(seen.min(axis=0)) - 2, 0).astype(int)
     high = np.minimum(np.ceil(seen.max(axis=0)) + 3, spec.size).astype(int)
     size = tuple((high - low).tolist())
-    # Twice as fine as the picture.
+    # Draw at twice the picture's resolution.
     canvas = np.zeros((2 * size[1], 2 * size[0], 4), np.uint8)
     sides = []
     for loop, top, foot in zip(loops, tops, feet, strict=True):
@@ -270,7 +272,7 @@ def _paint_tool(
             normal = np.array([along[1], -along[0]]) / length
             shade = 0.55 + 0.35 * float(normal @ [-0.6, -0.4])
             distance = float(np.linalg.norm(loop[i] - camera.C[:2]))
-            # Short pieces of uneven shade give the sides a texture.
+            # Shade the sides in short, uneven pieces, which gives them a texture.
             cuts = np.linspace(0, 1, max(1, round(length / _PIECE_MM)) + 1)
             for start, end in itertools.pairwise(cuts):
                 low_edge = foot[i] + np.outer((start, end), foot[j] - foot[i])
@@ -305,7 +307,7 @@ def _paint_tool(
 def _skin(
     cv2: Any, tool: PlacedTool, paints: Array, rng: np.random.Generator, middle: float
 ) -> Array:
-    """The colours of a tool's top, as square roots of linear values, at 2 pixels per mm."""
+    """Draws the colours of a tool's top, as square roots of linear values, at 2 pixels per mm."""
     x_low, y_low, x_high, y_high = tool.outline.bounds()
     width, height = int(2 * (x_high - x_low + 10)), int(2 * (y_high - y_low + 10))
     along = np.arange(width) / 2 + x_low - 5
@@ -314,7 +316,7 @@ def _skin(
         rng.normal(0, 1, (height, width)).astype(np.float32), (0, 0), 12, None, 0.7
     )
     colour *= np.clip(1 + 0.25 * streaks / streaks.std(), 0.2, 2)[..., None]
-    # Metal mirrors a lamp in a few bands.
+    # Draw a few bright bands, in which metal mirrors a lamp.
     for _ in range(2):
         where, wide = rng.uniform(x_low, x_high), rng.uniform(2, 6)
         shine = rng.uniform(0.2, 1.0) * np.exp(-(((along - where) / wide) ** 2))
@@ -324,19 +326,20 @@ def _skin(
 
 
 def _fine(pixels: Array) -> Array:
-    """Pixels of a picture twice as fine, in OpenCV's sixteenths."""
+    """Converts pixels to a picture of twice the resolution, in the sixteenths of a pixel that
+    OpenCV uses."""
     return np.round(16 * (2 * pixels + 0.5)).astype(np.int32)
 
 
 def _filled(cv2: Any, loops: list[Array], size: tuple[int, int]) -> Array:
-    """The share of each pixel that lies in loops of pixels."""
+    """Returns the share of each pixel that lies inside loops of pixels (n, 2)."""
     mask = np.zeros((2 * size[1], 2 * size[0]), np.uint8)
     cv2.fillPoly(mask, [_fine(loop) for loop in loops], 255, 8, 4)
     return cv2.resize(mask, size, interpolation=cv2.INTER_AREA).astype(np.float32) / 255
 
 
 def _distorted(cv2: Any, picture: Array, camera: _Camera, spec: PhotoSpec) -> Array:
-    """The picture through a lens with radial distortion."""
+    """Returns the picture through a lens with radial distortion."""
     u, v = np.meshgrid(*(np.arange(n, dtype=np.float32) for n in spec.size))
     points = np.stack([u, v], axis=-1).reshape(-1, 1, 2)
     lens = np.array([spec.distortion, 0, 0, 0])
@@ -355,7 +358,8 @@ def _srgb(linear: Array) -> Array:
 def placed_outline(
     outline: CrossSection, spec: PhotoSpec, angle: float, shift: tuple[float, float]
 ) -> CrossSection:
-    """An outline whose bounds' middle lies at the sheet's middle plus `shift`, turned."""
+    """Moves an outline so that the middle of its bounds lies at the sheet's middle plus `shift`,
+    turned by `angle`."""
     outline = outline.rotate(angle)
     x_low, y_low, x_high, y_high = outline.bounds()
     x = spec.sheet[0] / 2 + shift[0] - (x_low + x_high) / 2

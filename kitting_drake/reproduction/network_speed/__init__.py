@@ -1,7 +1,7 @@
-"""The cost of the networks on this machine: figure 6(c) of the paper, and related measurements.
+"""Measures the cost of the networks on this machine: figure 6(c) of the paper, and related numbers.
 
-All numbers come from one run on one machine, and compared alternatives are timed in alternation.
-Drake is not needed.
+All numbers come from one run on one machine. Compared alternatives are timed in alternation. Drake
+is not needed.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ from kitting_drake.reproduction.network_speed.timing import describe_machine, me
 def benchmark_networks(plan: Plan, console: Console) -> dict[str, Any]:
     """Runs all measurements of `benchmark networks`.
 
-    Times are in seconds of wall time, rates in operations per second; a multiply-accumulate is two
-    operations.
+    Times are wall times in seconds, and rates are operations per second. A multiply-accumulate
+    counts as two operations.
 
     Args:
-        plan: what to measure.
-        console: where to show progress.
+        plan: the measurements to make.
+        console: the console for the progress.
 
     Raises:
         UserError: the demonstrations are unusable.

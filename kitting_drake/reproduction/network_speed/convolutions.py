@@ -1,4 +1,4 @@
-"""Times a function's convolutions alone, as a lower bound of its time."""
+"""Times the convolutions of a function alone, as a lower bound of the function's time."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from kitting_drake.reproduction.network_speed.timing import Timing
 
 _GROUPS = {"aten::conv2d": 6, "aten::convolution": 8, "aten::convolution_backward": 9}
-"""torch's convolutions, each with the index of its `groups` argument."""
+"""torch's convolutions, each with the index of its argument `groups`."""
 
 
 class _Outline(NamedTuple):
-    """The shape, type and memory format of a tensor."""
+    """The shape, type and memory format of a tensor, without its values."""
 
     shape: tuple[int, ...]
     type: torch.dtype
@@ -32,7 +32,7 @@ class _Outline(NamedTuple):
         return cls(tuple(tensor.shape), tensor.dtype, channels_last)
 
     def filled(self, device: torch.device) -> Tensor:
-        """A tensor of random numbers of this shape, type and memory format."""
+        """Returns a tensor of random numbers with this shape, type and memory format."""
         tensor = torch.randn(self.shape, device=device).to(self.type)
         return (
             tensor.contiguous(memory_format=torch.channels_last) if self.channels_last else tensor
@@ -43,28 +43,29 @@ class _Outline(NamedTuple):
 class Convolutions:
     """The convolutions that a function computes, including those of its backward passes.
 
-    Depthwise convolutions are filters rather than layers, and are not included.
+    Depthwise convolutions are left out, because they are filters rather than layers.
     """
 
     calls: Counter[tuple[Any, tuple[Any, ...]]]
-    """The number of calls by torch's function and its arguments, with tensors as outlines."""
+    """The number of calls, by torch's function and its arguments; tensors are replaced by
+    outlines."""
 
     @classmethod
     def of(cls, function: Callable[[], object]) -> Convolutions:
-        """The convolutions of a function, which is run once."""
+        """Runs a function once and records its convolutions."""
         with _Recorder() as recorder:
             function()
         return cls(recorder.calls)
 
     def alone(self, device: torch.device) -> dict[Any, Callable[[], object]]:
-        """For each key of `calls`, a function that computes it once on random numbers."""
+        """Returns, for each key of `calls`, a function that computes it once on random numbers."""
         return {call: _replay(*call, device) for call in self.calls}
 
     def seconds(self, timings: dict[Any, Timing]) -> float:
-        """The total time of all calls.
+        """Returns the total time of all calls, in seconds.
 
         Args:
-            timings: the timings of each function of `alone`.
+            timings: the timing of each function of `alone`.
         """
         return sum(count * timings[call].seconds for call, count in self.calls.items())
 
@@ -85,7 +86,7 @@ class _Recorder(TorchDispatchMode):
         self, function: Any, types: Any, args: Any = (), kwargs: Any = None
     ) -> Any:
         place = _GROUPS.get(function.name())
-        # torch omits trailing arguments with default values; the default is one group.
+        # torch omits trailing arguments that have default values; the default is one group.
         if place is not None and args[place : place + 1] in ((), (1,)):
             outlined = (
                 _Outline.of(item)

@@ -1,4 +1,4 @@
-"""The speed of the SO(2) networks in this package relative to plain escnn."""
+"""Measures the speed of the SO(2) networks in this package relative to plain escnn."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ from kitting_drake.reproduction.network_speed.plan import SpeedSetup, times_of, 
 from kitting_drake.reproduction.network_speed.timing import Timing, count_operations
 
 MEASURES = ("training_step", "alpha_training_step", "decision", "alpha_inference")
-"""The timed operations."""
+"""The names of the timed operations."""
 
 
 def measure_folding(setup: SpeedSetup) -> dict[str, Any]:
-    """Times the SO(2) networks built from escnn's modules, and as this package runs them.
+    """Times the SO(2) networks both as built from escnn's modules and as this package runs them.
 
-    Both have the same weights and compute the same function, up to rounding.
+    All variants have the same weights and compute the same function, up to rounding.
 
     Returns:
         - `rungs`: the time of each of `MEASURES`, for each variant;
-        - `speed_up`: how many times faster than plain escnn in float32 it is;
-        - `convolution_share`: for our variants, the share of a training step and of a decision that
-          plain torch needs for convolutions of the same shapes and type;
+        - `speed_up`: the speed of each variant relative to plain escnn in float32;
+        - `convolution_share`: for the variants of this package, the share of a training step and of
+        a decision that plain torch needs for convolutions of the same shapes and type;
         - `alpha_difference`: the difference of alpha's output from plain escnn's, relative to its
-          standard deviation;
+        standard deviation;
         - `alpha_operations`: the operations of one inference of alpha.
     """
     ways = _ways(setup)
@@ -80,7 +80,7 @@ def measure_folding(setup: SpeedSetup) -> dict[str, Any]:
 
 
 def _ways(setup: SpeedSetup) -> dict[str, tuple[Networks, Networks]]:
-    """The variants of the networks, each for training and for inference."""
+    """Returns the variants of the networks, each for training and for inference."""
     ours = make_networks(NetworkConfig("so2", setup.plan.preset))
     assert isinstance(ours, SO2Networks)
     types = [type_ for type_ in (torch.float32, torch.bfloat16) if type_ in setup.peak]
@@ -88,7 +88,7 @@ def _ways(setup: SpeedSetup) -> dict[str, tuple[Networks, Networks]]:
     escnn = as_escnn(ours)
     for type_ in types:
         trained = _with_autocast(escnn, type_)
-        # In evaluation mode escnn caches the expanded kernels.
+        # In evaluation mode, escnn caches the expanded kernels.
         exported = copy.deepcopy(trained).eval().requires_grad_(False)
         ways[f"escnn_{type_name(type_)}"] = (trained, exported)
     for type_ in types:
@@ -100,7 +100,7 @@ def _ways(setup: SpeedSetup) -> dict[str, tuple[Networks, Networks]]:
 
 
 def _with_autocast(escnn: Networks, type_: torch.dtype) -> Networks:
-    """A copy that computes in a type with torch's automatic mixed precision."""
+    """Returns a copy that computes in a given type with torch's automatic mixed precision."""
     escnn = copy.deepcopy(escnn)
     for network in escnn.children():
         if isinstance(network, EscnnUNet | EscnnAngleNet):
@@ -111,7 +111,7 @@ def _with_autocast(escnn: Networks, type_: torch.dtype) -> Networks:
 def _time_ways(
     setup: SpeedSetup, ways: dict[str, tuple[Networks, Networks]]
 ) -> dict[str, dict[str, Timing]]:
-    """The timings of each of `MEASURES` for each variant."""
+    """Times each of `MEASURES` for each variant."""
     trained = {name: pair[0] for name, pair in ways.items()}
     exported = {name: pair[1] for name, pair in ways.items()}
     return {
@@ -133,9 +133,10 @@ def _time_ways(
 
 
 def _convolution_share(function: Callable[[], object], setup: SpeedSetup, training: bool) -> float:
-    """The share of a function's time that its convolutions alone take."""
+    """Returns the share of a function's time that its convolutions alone take."""
     convolutions = Convolutions.of(function)
-    # Time them in alternation with the function, to share the effect of other load.
+    # Time the convolutions in alternation with the function, so that both share the effect of other
+    # load.
     functions: dict[Any, Callable[[], object]] = {"all": function}
     functions |= convolutions.alone(setup.device)
     timings = setup.time_each(functions, training=training)
@@ -143,26 +144,29 @@ def _convolution_share(function: Callable[[], object], setup: SpeedSetup, traini
 
 
 def _alpha(networks: Networks, setup: SpeedSetup) -> tuple[nn.Module, Tensor]:
-    """The network alpha and its input."""
+    """Returns the network alpha and its input."""
     return networks.get_submodule("alpha"), setup.inputs(networks)["alpha"]
 
 
 def computing_in(networks: Networks, type_: torch.dtype) -> Networks:
-    """A copy for training that computes in another type."""
+    """Returns a copy for training that computes in another type."""
     networks = copy.deepcopy(networks)
     networks.compute_type = type_
     return networks
 
 
 def _training(networks: Networks, scene: ObservedScene) -> Callable[[], object]:
-    """The same training steps of all four networks for all variants, including augmentation."""
+    """Returns a function that makes training steps of all four networks, including augmentation.
+
+    The steps are the same for all variants.
+    """
     trainer = Trainer(networks, seed=0, curvature=True)
     samples = labelled_images([scene], taken_only=False)
     return lambda: trainer.step(samples)
 
 
 def stepping(network: nn.Module, features: Tensor) -> Callable[[], object]:
-    """A training step of one network: forward, backward, Adam."""
+    """Returns a function that makes a training step of one network: forward, backward, Adam."""
     optimiser = torch.optim.Adam(network.parameters(), lr=1e-6)
 
     def step() -> None:
@@ -174,7 +178,7 @@ def stepping(network: nn.Module, features: Tensor) -> Callable[[], object]:
 
 
 def inferring(network: nn.Module, features: Tensor) -> Callable[[], object]:
-    """One inference of a network."""
+    """Returns a function that makes one inference of a network."""
     return lambda: network(features)
 
 

@@ -1,4 +1,5 @@
-"""The cost of a prediction at N orientations: figure 6(c) of the paper, and whole decisions."""
+"""Measures the cost of predictions at N orientations: figure 6(c) of the paper, and whole
+decisions."""
 
 from __future__ import annotations
 
@@ -25,17 +26,18 @@ PARTS = {
     "phi": ("phi",),
     "psi": ("psi",),
 }
-"""The networks of each part of a decision. The remaining part is `search`: the correlation, and the
+"""The networks of each part of a decision. One more part, `search`, is the correlation and the
 processing of inputs and outputs."""
 
 _MADE_FOR_N = ("equivariant_transporter",)
-"""Methods with N in their architecture; the other methods' networks predict at any N."""
+"""The methods whose architecture depends on N. The networks of the other methods predict at any
+N."""
 
 
 def measure_pick_angles(setup: SpeedSetup, preset: str) -> list[dict[str, Any]]:
-    """The parameters and inference time of the pick-angle models.
+    """Measures the parameters and the inference time of the models that predict the pick angle.
 
-    For the Transporter this is its whole picking module, which sees the scene at every angle.
+    For the Transporter, this is its whole picking module, which sees the scene at every angle.
 
     Returns:
         A row for each method and N.
@@ -57,8 +59,8 @@ def measure_pick_angles(setup: SpeedSetup, preset: str) -> list[dict[str, Any]]:
         skipped = {n: setup.why_not(outlined, count) for n, count in operations.items()}
         timings: dict[int, Timing] = {}
         if not all(skipped.values()):
-            # Untrained networks are as fast as trained ones. An evaluation would load them from a
-            # file, but that file could take gigabytes.
+            # Use untrained networks, which are as fast as trained ones. They are not loaded from a
+            # file, as in an evaluation, because the file could take gigabytes.
             networks = _without_others(make_networks(config, PlainConv2d), names).to(setup.device)
             networks.freeze(preferred_type())
             timings = setup.time_each(
@@ -80,7 +82,7 @@ def measure_pick_angles(setup: SpeedSetup, preset: str) -> list[dict[str, Any]]:
 
 
 def _cells(plan: Plan) -> Iterator[tuple[str, tuple[int, ...]]]:
-    """Each method with the values of N that share one set of its networks."""
+    """Yields each method with the values of N for which one set of its networks is enough."""
     for method in METHODS:
         if method in _MADE_FOR_N:
             yield from ((method, (n,)) for n in plan.orientations)
@@ -91,21 +93,23 @@ def _cells(plan: Plan) -> Iterator[tuple[str, tuple[int, ...]]]:
 
 
 def _outlined(config: NetworkConfig) -> Networks:
-    """Plain networks on the meta device, to count operations without computing."""
+    """Returns plain networks on the meta device, to count operations without computing."""
     with torch.device("meta"):
         return make_networks(config, PlainConv2d).to("meta").requires_grad_(False)
 
 
 def _without_others(networks: Networks, names: set[str]) -> Networks:
-    """The networks with only the named children; frees the memory of the others."""
+    """Removes all children but the named ones from networks, to free their memory."""
     for name in [name for name, _ in networks.named_children() if name not in names]:
         delattr(networks, name)
     return networks
 
 
 def _compute_angles(networks: Networks, setup: SpeedSetup, n: int) -> Callable[[], object]:
-    """Computes all angles at a known pixel, without reading the result, which has no values on the
-    meta device."""
+    """Returns a function that computes all angles at a known pixel.
+
+    It does not read the result, because the result has no values on the meta device.
+    """
     if isinstance(networks, FactoredNetworks):
         crops = networks.prepare(crop(setup.image, setup.pixel, PICK_CROP))
         return lambda: networks.crop_angle_logits(crops, n)
@@ -113,17 +117,17 @@ def _compute_angles(networks: Networks, setup: SpeedSetup, n: int) -> Callable[[
 
 
 def _predict_angle(networks: Networks, setup: SpeedSetup, n: int) -> Callable[[], object]:
-    """Predicts the angle at a known pixel."""
+    """Returns a function that predicts the angle at a known pixel."""
     if isinstance(networks, FactoredNetworks):
         return lambda: networks.predict_angle(setup.image, setup.pixel, n)
     return lambda: networks.predict_pick(setup.image, n).angle(setup.pixel)
 
 
 def measure_decisions(setup: SpeedSetup) -> list[dict[str, Any]]:
-    """The time of a whole decision of exported networks, and of its parts.
+    """Times whole decisions of exported networks, and their parts.
 
     Returns:
-        A row for each method and N. The parts are those of the run with median time.
+        A row for each method and N. The times of the parts are those of the run with median time.
     """
     rows = []
     for method, orientations in _cells(setup.plan):
@@ -164,7 +168,8 @@ def measure_decisions(setup: SpeedSetup) -> list[dict[str, Any]]:
 
 
 def _compute_others(networks: Networks, setup: SpeedSetup, n: int) -> Callable[[], object]:
-    """All computations of the networks for a decision, except for angles and search."""
+    """Returns a function with all computations of the networks for a decision, except angles and
+    search."""
 
     def compute() -> None:
         # The Transporter computes positions together with angles.
@@ -204,7 +209,8 @@ class _WatchedPolicy:
         return hook
 
     def deciding(self, orientations: int, runs: list[dict[str, float]]) -> Callable[[], object]:
-        """A function that decides at N and appends the seconds of its parts to `runs`."""
+        """Returns a function that decides at N and appends the times of its parts, in seconds, to
+        `runs`."""
         policy = LearnedPolicy(self._networks, orientations=orientations)
 
         def decide() -> None:
@@ -219,11 +225,11 @@ class _WatchedPolicy:
 
 
 def growth(rows: list[dict[str, Any]], orientations: tuple[int, ...]) -> list[dict[str, Any]]:
-    """The cost at the largest N relative to that at the smallest.
+    """Returns the ratio of the cost at the largest N to that at the smallest.
 
     Args:
         rows: the rows of `measure_pick_angles` or `measure_decisions`.
-        orientations: N.
+        orientations: the values of N.
 
     Returns:
         A row of ratios for each preset and method; None for values that were not measured.

@@ -1,4 +1,4 @@
-"""The share of the machine's peak that the SO(2) networks reach, in total and by level."""
+"""Measures the share of the machine's peak rate that the SO(2) networks reach."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from kitting_drake.reproduction.network_speed.timing import count_operations, re
 
 
 def measure_shares(setup: SpeedSetup) -> list[dict[str, Any]]:
-    """The share of the machine's peak that the SO(2) networks reach.
+    """Measures the share of the machine's peak rate that each of the SO(2) networks reaches.
 
     Returns:
         A row for each network, type and mode (`inference`, `training`).
@@ -59,7 +59,7 @@ def measure_levels(setup: SpeedSetup) -> dict[str, Any]:
 
     Returns:
         `levels` and `layers`, with median times. A level's `convolution_s` is the time of its
-        convolutions; `rest_s` is that of ELU, sums, resampling and concatenation.
+        convolutions; its `rest_s` is the time of ELU, sums, resampling and concatenation.
     """
     type_ = preferred_type()
     networks = setup.export(make_networks(NetworkConfig("so2", setup.plan.preset)), type_)
@@ -71,7 +71,7 @@ def measure_levels(setup: SpeedSetup) -> dict[str, Any]:
     with torch.inference_mode():
         for repeat in range(setup.plan.repeats + 2):
             seconds = watch.run(features)
-            # The first two runs warm up.
+            # The first two runs are for warming up.
             if repeat >= 2:
                 runs.append(seconds)
     median = {name: float(np.median([run[name] for run in runs])) for name in runs[0]}
@@ -109,14 +109,14 @@ def measure_levels(setup: SpeedSetup) -> dict[str, Any]:
 
 
 class _UNetWatch:
-    """Hooks that record the start and end of each level and convolution of a U-net."""
+    """Hooks that record the start and end of each level and each convolution of a U-net."""
 
     def __init__(self, network: UNet, device: torch.device) -> None:
         self._network, self._device = network, device
         self._starts: dict[str, float] = {}
         self._ends: dict[str, float] = {}
         self.operations: dict[str, int] = {}
-        """The operations of each convolution."""
+        """The number of operations of each convolution."""
         self.types: dict[str, torch.dtype] = {}
         """The type in which each convolution computes."""
         self._blocks = {
@@ -152,7 +152,7 @@ class _UNetWatch:
         return hook
 
     def run(self, features: Tensor) -> dict[str, float]:
-        """The seconds of each level and each convolution in one inference."""
+        """Runs one inference; returns the time of each level and each convolution, in seconds."""
         start = read_clock(self._device)
         self._network(features)
         end = read_clock(self._device)
@@ -161,7 +161,7 @@ class _UNetWatch:
             for names in self.layers.values()
             for name in names
         }
-        # Count the resampling and concatenation before a block as part of it.
+        # Count the resampling and concatenation before a block as parts of the block.
         seconds["input"] = self._starts["down.0"] - start
         before = self._starts["down.0"]
         for block, level in self._blocks.items():

@@ -1,4 +1,4 @@
-"""The common part of all network measurements: the plan, the machine and the observation."""
+"""The plan, the machine and the observation that all network measurements share."""
 
 from __future__ import annotations
 
@@ -32,29 +32,29 @@ from kitting_drake.reproduction.network_speed.timing import (
 from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
 
 _EXPECTED_SHARE = 0.3
-"""The assumed share of the machine's peak, to predict times."""
+"""The share of the machine's peak rate that is assumed when times are predicted."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """The measurements, and the number of their repeats."""
+    """The measurements to make, and the number of their repeats."""
 
     preset: str = "small"
     compared_preset: str | None = "paper"
-    """Another preset, of which only the pick-angle models are measured."""
+    """Another preset, for which only the models of the pick angle are measured."""
     orientations: tuple[int, ...] = (36, 72, 120, 180)
-    """N of section V-B.1 of the paper."""
+    """The values of N in section V-B.1 of the paper."""
     finer: int = 720
     """An additional N for the SO(2) method."""
     repeats: int = 9
     """The number of timings for each median."""
     peak_side: int = 2048
-    """The side of the matrices whose product measures the peak; four times that on an accelerator.
-    """
+    """The side of the matrices whose product gives the peak rate. On an accelerator it is four
+    times that."""
     budget: float = 60.0
-    """The time for each number, in seconds; measurements that would take longer are skipped."""
+    """The time for each number, in seconds. Measurements that would take longer are skipped."""
     demonstrations: Path | None = None
-    """The file with the observation; None for a synthetic one."""
+    """The file from which to take the observation; None for a synthetic one."""
 
     def __post_init__(self) -> None:
         if self.preset not in PRESETS:
@@ -77,24 +77,24 @@ class SpeedSetup:
     def __post_init__(self) -> None:
         self.image: Image = self.scene.recorded.image
         row, col = np.rint(self.scene.targets[0].pick).astype(int)
-        # Stored here because `targets` decodes the image, which must not be timed.
+        # Store the pixel, because `targets` decodes the image, which must not be timed.
         self.pixel = int(row), int(col)
-        """(row, col) of the expert's pick."""
+        """The (row, col) of the expert's pick."""
 
     def observe(self) -> Observation:
-        """The observation of the timed decisions."""
+        """Returns the observation of the timed decisions."""
         return Observation(self.image, self.scene.grid)
 
     def time_each(
         self, functions: dict[Any, Callable[[], object]], *, training: bool = False
     ) -> dict[Any, Timing]:
-        """`timing.time_each` with the plan's repeats and budget."""
+        """Times functions by `timing.time_each`, with the plan's repeats and budget."""
         plan = self.plan
         with torch.inference_mode(not training):
             return time_each(functions, self.device, repeats=plan.repeats, budget=plan.budget)
 
     def inputs(self, networks: Networks) -> dict[str, Tensor]:
-        """The input of each network."""
+        """Returns the input of each network."""
         scene = networks.prepare(self.image)
         return {
             "alpha": scene,
@@ -104,19 +104,19 @@ class SpeedSetup:
         }
 
     def export(self, networks: Networks, type_: torch.dtype) -> Networks:
-        """The networks as in evaluation: saved, and loaded as plain convolutions."""
+        """Saves networks and loads them as plain convolutions, as in an evaluation."""
         path = self.folder / "networks.safetensors"
         save_weights(path, networks, {})
         return load_networks(path, type_).to(self.device)
 
     def count(self, key: Hashable, function: Callable[[], object]) -> int:
-        """`timing.count_operations`, once for each key."""
+        """Counts operations by `timing.count_operations`, once for each key."""
         if key not in self._counts:
             self._counts[key] = count_operations(function)
         return self._counts[key]
 
     def why_not(self, outlined: Networks, operations: int) -> str | None:
-        """The reason to skip a measurement; None to run it.
+        """Returns the reason to skip a measurement; None to run it.
 
         Args:
             outlined: the networks, on the meta device.
@@ -132,17 +132,17 @@ class SpeedSetup:
 
 
 def times_of(timing: Timing | None) -> dict[str, Any]:
-    """A timing in the format of the results."""
+    """Returns a timing in the format of the results."""
     return dataclasses.asdict(timing) if timing else {"seconds": None}
 
 
 def type_name(type_: torch.dtype) -> str:
-    """A type in the format of the results, for example `float32`."""
+    """Returns a type's name in the format of the results, for example `float32`."""
     return str(type_).removeprefix("torch.")
 
 
 def observed_scene(path: Path | None) -> ObservedScene:
-    """The first observation of a demonstration, or a synthetic one.
+    """Returns the first observation of a file of demonstrations, or a synthetic one.
 
     Raises:
         UserError: the demonstrations are unusable.
@@ -153,19 +153,20 @@ def observed_scene(path: Path | None) -> ObservedScene:
     grid = demonstrations.origin.grid
     observed = scenes(demonstrations.demonstrations, grid, later_picks_possible=True)
     if not observed:
-        raise UserError(f"{path} holds no demonstrations")
+        raise UserError(f"{path} has no demonstrations")
     return observed[0]
 
 
 def synthetic_scene(grid: PixelGrid) -> ObservedScene:
-    """Four bars on a table, and a block with a recess for each."""
+    """Returns a scene with four bars on a table, and a block with a recess for each bar."""
     random = np.random.default_rng(0)
     pixel = np.stack(np.meshgrid(np.arange(grid.rows), np.arange(grid.cols), indexing="ij"), -1)
     image = np.full((4, *grid.shape), 0.4, np.float32)
     image[3] = 0.0
 
     def bar(middle: NDArray[np.float64], angle: float, length: float, width: float) -> Any:
-        """The pixels (rows, cols) of a bar; lengths in metres, along the rows at angle 0."""
+        """Returns the pixels (rows, cols) of a bar; lengths in metres, along the rows at angle
+        0."""
         along, across = np.moveaxis(np.abs((pixel - middle) @ rotation_matrix(angle)), -1, 0)
         half = 0.5 * np.array([length, width]) / grid.resolution
         return (along <= half[0]) & (across <= half[1])

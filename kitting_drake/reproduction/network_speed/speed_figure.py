@@ -1,4 +1,4 @@
-"""The figure of `benchmark networks`: figure 6(c) of the paper, and related measurements."""
+"""Draws the figure of `benchmark networks`: figure 6(c) of the paper, and related measurements."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from kitting_drake.reproduction.network_speed.speed_tables import (
 )
 
 _METHODS = {"so2": "#009e73", "equivariant_transporter": "#e69f00", "transporter": "#56646f"}
-"""Colours for the colour-blind too; the first two are the paper's green and orange."""
+"""Colours that the colour-blind can distinguish; the first two are the paper's green and orange."""
 _MARKERS = {"so2": "o", "equivariant_transporter": "s", "transporter": "^"}
 _RUNGS = {
     "escnn_float32": "#c9c9c9",
@@ -25,9 +25,9 @@ _RUNGS = {
     "ours_bfloat16": "#009e73",
 }
 _BARRED = ("training_step", "decision")
-"""The measures that have bars; the tables have them all."""
+"""The measures that are drawn as bars; the tables have all measures."""
 _COLUMNS = 6
-"""The number of columns of the mosaic of panels, divided among the presets."""
+"""The number of columns of the grid of panels, which the presets share."""
 _STYLE = {
     "font.size": 12.0,
     "axes.edgecolor": "0.5",
@@ -47,7 +47,7 @@ def draw_networks(measured: dict[str, Any], path: Path) -> None:
 
     Args:
         measured: the result of `benchmark_networks`.
-        path: a .png file.
+        path: a .png file to write.
 
     Raises:
         UserError: the file cannot be written.
@@ -86,7 +86,7 @@ def draw_networks(measured: dict[str, Any], path: Path) -> None:
 
 
 def _conditions(measured: dict[str, Any]) -> str:
-    """The machine and the type of the numbers, in words."""
+    """Describes in words the machine and the type of the numbers."""
     machine = measured["machine"]
     place = machine["cpu"] if machine["device"] == "cpu" else machine["device"]
     threads = f"{machine['threads']} thread{'s' if machine['threads'] > 1 else ''}"
@@ -100,7 +100,7 @@ def _conditions(measured: dict[str, Any]) -> str:
 def _draw_lines(
     axis: Any, rows: list[dict[str, Any]], quantity: str, text: Callable[[float], str]
 ) -> None:
-    """A line over N for each method, with the values at both of its ends."""
+    """Draws a line over N for each method, with the values at both of its ends."""
     from matplotlib.ticker import LogLocator, NullLocator
 
     counts = sorted({row["orientations"] for row in rows})
@@ -123,7 +123,7 @@ def _draw_lines(
         for row in {id(row): row for row in chosen[:1] + chosen[-1:]}.values():
             _label(axis, row, measured, counts, quantity, text)
     low, high = axis.get_ylim()
-    # Room for the labels: at least two decades, and a quarter more at each end.
+    # Make room for the labels: show at least two decades, and a quarter more at each end.
     spread = max(high / low, 100.0) ** 0.25
     axis.set_ylim(low / spread, high * spread)
     axis.yaxis.set_major_locator(LogLocator(numticks=6))
@@ -143,7 +143,8 @@ def _label(
     quantity: str,
     text: Callable[[float], str],
 ) -> None:
-    """Writes the value of a point above it, or below it if it is the lowest of several at one N."""
+    """Writes the value of a point above it, or below it if it is the lowest of several points at
+    one N."""
     there = [other[quantity] for other in rows if other["orientations"] == row["orientations"]]
     below = len(there) > 1 and row[quantity] == min(there)
     axis.annotate(

@@ -1,4 +1,4 @@
-"""The results of `benchmark networks` as tables for the terminal."""
+"""Makes tables of the results of `benchmark networks`, for the terminal."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ MEASURE_NAMES = {
 
 
 def network_tables(measured: dict[str, Any]) -> list[Table]:
-    """All tables of `benchmark networks`.
+    """Returns all tables of `benchmark networks`.
 
     Args:
         measured: the result of `benchmark_networks`.
@@ -50,7 +50,7 @@ def network_tables(measured: dict[str, Any]) -> list[Table]:
 
 
 def _milliseconds_text(seconds: float | None) -> str:
-    """A time in ms, without the unit."""
+    """Returns a time in ms as text, without the unit."""
     if seconds is None:
         return "-"
     return f"{1e3 * seconds:.0f}" if seconds >= 0.1 else f"{1e3 * seconds:.2g}"
@@ -63,8 +63,10 @@ def _add_by_method(
     cells: Callable[[dict[str, Any]], Iterable[str]],
     growth_cells: Callable[[dict[str, Any]], Iterable[str]],
 ) -> None:
-    """Adds, for each method, a line for each N and one for the growth from the smallest to the
-    largest N."""
+    """Adds lines to a table, for each method: one for each N, and one for the growth.
+
+    The growth is the ratio of the values at the largest and the smallest N.
+    """
     for method in dict.fromkeys(row["method"] for row in rows):
         chosen = [row for row in rows if row["method"] == method]
         for row in chosen:

@@ -1,4 +1,4 @@
-"""Timing, operation counts and the machine's peak, for benchmarks of networks."""
+"""Measures times, operation counts and the machine's peak rate, for benchmarks of networks."""
 
 from __future__ import annotations
 
@@ -19,9 +19,10 @@ from torch.utils.flop_counter import flop_registry
 Name = TypeVar("Name")
 
 _WARM_UPS = 2
-"""The largest number of uncounted runs, in which kernels are chosen and memory is allocated."""
+"""The largest number of runs before the timed ones, in which kernels are chosen and memory is
+allocated."""
 _PEAK_RUNS = 15
-"""The number of runs; the fastest gives the peak."""
+"""The number of runs for the peak rate, of which the fastest counts."""
 
 
 @dataclass(frozen=True)
@@ -29,19 +30,19 @@ class Timing:
     """The wall time of an operation, in seconds."""
 
     seconds: float
-    """The median."""
+    """The median time."""
     fastest: float
     slowest: float
     runs: int
 
     @classmethod
     def of(cls, times: list[float]) -> Timing:
-        """The timing of some runs."""
+        """Makes the timing of some runs from their times in seconds."""
         return cls(float(np.median(times)), min(times), max(times), len(times))
 
 
 def read_clock(device: torch.device) -> float:
-    """The time in seconds, after the device has finished all its work."""
+    """Returns the time in seconds after the device has finished all its work."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
     return time.perf_counter()
@@ -54,12 +55,12 @@ def time_each(
     repeats: int,
     budget: float,
 ) -> dict[Name, Timing]:
-    """Times functions in alternation, to share the effect of other load on the machine.
+    """Times functions in alternation, so that all share the effect of other load on the machine.
 
     Args:
-        functions: the functions.
+        functions: the functions by name.
         device: the device on which they compute.
-        repeats: the number of timings of each, after warming up.
+        repeats: the number of timings of each function, after warming up.
         budget: the time in seconds after which a function is not run again.
     """
     spent = dict.fromkeys(functions, 0.0)
@@ -74,14 +75,14 @@ def time_each(
             elapsed = read_clock(device) - start
             spent[name] += elapsed
             times[name].append(elapsed)
-    # If there was only time for warm-up runs, the last of them counts.
+    # If there was only time for warm-up runs, use the last of them.
     return {name: Timing.of(runs[warm_ups:] or runs[-1:]) for name, runs in times.items()}
 
 
 def count_operations(function: Callable[[], object]) -> int:
-    """The floating-point operations of a function's convolutions and matrix products.
+    """Counts the floating-point operations of a function's convolutions and matrix products.
 
-    A multiply-accumulate counts as two. Backward passes are included. Functions in
+    A multiply-accumulate counts as two operations. Backward passes are included. Functions in
     `torch.inference_mode` cannot be counted.
     """
     with _OperationCounter() as counter:
@@ -90,7 +91,7 @@ def count_operations(function: Callable[[], object]) -> int:
 
 
 class _OperationCounter(TorchDispatchMode):
-    """Counts with torch's formulas; torch's own FlopCounterMode takes ten times as long."""
+    """A counter with torch's formulas; torch's own FlopCounterMode takes ten times as long."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -108,16 +109,16 @@ class _OperationCounter(TorchDispatchMode):
 
 
 def measure_peak(type_: torch.dtype, device: torch.device, *, side: int) -> dict[str, float]:
-    """The machine's peak, in operations per second.
+    """Measures the machine's peak rate, in operations per second.
 
     Args:
-        type_: the type to compute in.
-        device: the device to compute on.
+        type_: the type in which to compute.
+        device: the device on which to compute.
         side: the side of the matrices; the convolution has an eighth as many channels.
 
     Returns:
-        `matmul`, the rate of a product of large square matrices; `convolution`, that of a wide 3x3
-        convolution in channels_last; and `best`, the larger of both.
+        `matmul`, the rate of a product of large square matrices; `convolution`, the rate of a wide
+        3x3 convolution in channels_last; and `best`, the larger of the two.
     """
     channels = side // 8
     matrix = torch.randn(side, side, device=device, dtype=type_)
@@ -139,7 +140,7 @@ def measure_peak(type_: torch.dtype, device: torch.device, *, side: int) -> dict
 
 
 def describe_machine(device: torch.device) -> dict[str, Any]:
-    """The machine of the measurements."""
+    """Returns a description of the machine on which the measurements run."""
     return {
         "cpu": _cpu_name(),
         "cores": len(os.sched_getaffinity(0)),
@@ -147,13 +148,13 @@ def describe_machine(device: torch.device) -> dict[str, Any]:
         "device": torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
         "torch": torch.__version__,
         "python": platform.python_version(),
-        # The load of other programs before the measurements; 0 on an idle machine.
+        # The load by other programs before the measurements; it is 0 on an idle machine.
         "load_before": os.getloadavg()[0],
     }
 
 
 def memory_bytes(device: torch.device) -> int:
-    """The memory of the machine or the accelerator, whichever is less."""
+    """Returns the memory of the machine or the accelerator, whichever is smaller, in bytes."""
     size = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     if device.type == "cuda":
         size = min(size, torch.cuda.get_device_properties(device).total_memory)

@@ -1,1 +1,1 @@
-"""The page of results, generated from result files."""
+"""Generates the pages of results from result files."""

@@ -1,10 +1,10 @@
-"""Markdown that is readable as source."""
+"""Formats text and tables in Markdown that is readable as source."""
 
 from collections.abc import Sequence
 
 
 def rate_text(rate: float, interval: Sequence[float]) -> str:
-    """A rate and its interval in percent; both are given as shares of one."""
+    """Formats a rate and its interval in percent; both are given as shares from 0 to 1."""
     low, high = interval
     return f"{100 * rate:.1f} ({100 * low:.1f} to {100 * high:.1f})"
 
@@ -12,15 +12,15 @@ def rate_text(rate: float, interval: Sequence[float]) -> str:
 def markdown_table(
     headings: Sequence[str], rows: Sequence[Sequence[str]], left_columns: int = 1
 ) -> str:
-    """A table with an aligned source.
+    """Formats a table whose source is aligned.
 
     Args:
         headings: the headings of the columns.
-        rows: cells.
-        left_columns: the number of leading columns that are aligned left; the others are aligned
+        rows: the cells of each row.
+        left_columns: the number of leading columns that are aligned left. The others are aligned
             right.
     """
-    # Some readers require rules of at least three characters.
+    # Make rules of at least three characters, because some readers require it.
     widths = [max(3, *map(len, column)) for column in zip(headings, *rows, strict=True)]
     rule = [
         "-" * width if index < left_columns else "-" * (width - 1) + ":"

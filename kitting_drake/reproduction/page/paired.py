@@ -1,4 +1,4 @@
-"""Paired differences of two runs on the same seeds, and tool-level intervals of a rate.
+"""Computes paired differences of two runs on the same seeds, and intervals of a rate over tools.
 
 Both intervals are bootstrap intervals. They are too narrow where few episodes differ or few tools
 fail.
@@ -16,10 +16,10 @@ _RESAMPLES = 10_000
 _TAILS = (2.5, 97.5)
 """The percentiles of a 95 % interval."""
 _FEWEST_TOOLS = 3
-"""With fewer tools that ever fail, a bootstrap over tools is not informative."""
+"""The least number of tools that ever fail at which a bootstrap over tools is informative."""
 
 STRICT, OWN = "strict_success_rate", "success_rate"
-"""The two rates of an episode: strict, and by the task's own measure."""
+"""The two rates of an episode: of strict success, and of success by the task's own measure."""
 
 
 @dataclass(frozen=True)
@@ -34,10 +34,11 @@ class Estimate:
 def paired_difference(
     first: Mapping[str, Any], second: Mapping[str, Any], rate: str
 ) -> Estimate | None:
-    """How much better one run is than another, on the seeds that both ran.
+    """Computes how much better one run is than another, on the seeds that both ran.
 
-    The interval is a bootstrap over episodes, each with both of its rates, so scenes that are hard
-    for both runs cancel. It does not include the variation between trainings of a method.
+    The interval is a bootstrap over episodes. Each episode is drawn with the rates of both runs, so
+    scenes that are hard for both cancel. The interval does not include the variation between
+    trainings of a method.
 
     Args:
         first: a summary with its `outcomes`.
@@ -45,7 +46,7 @@ def paired_difference(
         rate: `STRICT` or `OWN`.
 
     Returns:
-        The mean over the common seeds; None without any.
+        The mean difference over the common seeds; None if there are none.
     """
     return mean_paired_difference([(first, second)], rate)
 
@@ -53,7 +54,7 @@ def paired_difference(
 def mean_paired_difference(
     pairs: Sequence[tuple[Mapping[str, Any], Mapping[str, Any]]], rate: str
 ) -> Estimate | None:
-    """How much better the first run of each pair is than the second, on average over the pairs.
+    """Computes how much better the first run of each pair is, on average over the pairs.
 
     Episodes are resampled jointly over all runs, because they share their scenes.
 
@@ -62,7 +63,7 @@ def mean_paired_difference(
         rate: `STRICT` or `OWN`.
 
     Returns:
-        The mean over the common seeds; None without any.
+        The mean difference over the common seeds; None if there are none.
     """
     runs = [
         [{item["seed"]: item[rate] for item in run["outcomes"]} for run in pair] for pair in pairs
@@ -80,16 +81,16 @@ def mean_paired_difference(
 
 
 def points_text(found: Estimate) -> str:
-    """A difference of rates in points, with its interval if any episode differs."""
+    """Formats a difference of rates in points, with its interval if any episode differs."""
     if found.low == found.high == 0:
         return "+0.0 (none differs)"
     return f"{100 * found.value:+.1f} ({100 * found.low:+.1f} to {100 * found.high:+.1f})"
 
 
 def over_tools(outcomes: Sequence[Mapping[str, Any]], rate: str) -> Estimate | None:
-    """The share of successes with a bootstrap interval over tools.
+    """Computes the share of successes, with a bootstrap interval over tools.
 
-    This interval applies to other tools of the same kind, unlike intervals over objects.
+    This interval applies to other tools of the same kind, unlike an interval over objects.
 
     Args:
         outcomes: the outcomes of a summary.

@@ -1,4 +1,5 @@
-"""The shipped policies on the unseen toolsets of the paper, all runs pooled."""
+"""Writes the section on the shipped policies on the paper's unseen toolsets, with all runs
+pooled."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -19,13 +20,13 @@ _, _UNSEEN = PAPER_TASKS
 
 
 def pooled_section(runs: Sequence[Run]) -> list[str]:
-    """The section that pools, for each shipped policy, its runs with its default options.
+    """Writes the section that pools the runs of each shipped policy with its default options.
 
-    It is empty without such a run. Weights must have the digest of the shipped ones. No seed counts
-    twice.
+    Only runs whose weights have the digest of the shipped ones count, and no seed counts twice.
+    Without such runs, there is no section.
 
     Args:
-        runs: all reproducible runs that fill no cell.
+        runs: all reproducible runs that fill no cell of the paper's tables.
 
     Raises:
         UserError: two runs of a policy share a seed.
@@ -58,7 +59,7 @@ def pooled_section(runs: Sequence[Run]) -> list[str]:
 
 
 def shipped_policies() -> dict[str, Policy]:
-    """The policies that need no training, by their names in tables."""
+    """Returns the policies that need no training, by their names in tables."""
     return {
         "generalist": Learned(weights=""),
         "from 100 demonstrations": load_scenario(SCENARIOS / "paper/kitting_unseen.yaml").policy,
@@ -67,8 +68,10 @@ def shipped_policies() -> dict[str, Policy]:
 
 
 def _is_of(run: Run, policy: Policy) -> bool:
-    """Whether a run is of this policy, with its weights and options. Older runs may lack newer
-    options."""
+    """Whether a run is of this policy, with its weights and options.
+
+    Options that the run's summary lacks are ignored.
+    """
     found: dict[str, Any] = run.summary["resolved_scenario"]["policy"]
     expected: dict[str, Any] = described(Scenario(policy=policy))["policy"]
     return run.summary.get("policy_digest") == policy.digest(SCENARIOS / "paper") and all(
@@ -81,4 +84,4 @@ def _check_seeds(label: str, runs: Sequence[Run]) -> None:
     twice = min((seed for seed, count in counts.items() if count > 1), default=None)
     if twice is not None:
         files = " and ".join(run.name for run in runs if twice in run.summary["seeds"])
-        raise UserError(f"{files} both hold seed {twice} of {label}: remove one")
+        raise UserError(f"{files} both have seed {twice} of {label}: remove one of them")

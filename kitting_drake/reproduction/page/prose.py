@@ -1,4 +1,4 @@
-"""The prose of the pages of results, which stands in `prose.md`."""
+"""Reads the prose of the pages of results from `prose.md`."""
 
 import re
 from functools import cache
@@ -8,10 +8,10 @@ _PART = re.compile(r"<!-- part: (\w+) -->\n")
 
 
 def prose(part: str, **values: object) -> str:
-    """A part of the prose, with a final newline.
+    """Returns a part of the prose, with a final newline.
 
     Args:
-        part: its name.
+        part: the name of the part.
         values: the values for the placeholders `{name}`.
 
     Raises:

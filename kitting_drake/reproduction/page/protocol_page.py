@@ -1,4 +1,4 @@
-"""The protocol, docs/protocol.md: every run behind the figures of docs/results.md."""
+"""Writes the protocol, docs/protocol.md: every run behind the figures of docs/results.md."""
 
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
@@ -15,18 +15,18 @@ from kitting_drake.reproduction.page.runs import LEARNED, METHODS, Run
 from kitting_drake.tasks import PAPER_TASKS
 
 _ORIENTATIONS = (36, 72, 120, 180)
-"""N of the paper (section V-C.1)."""
+"""The values of N in section V-C.1 of the paper."""
 
 
 @dataclass(frozen=True)
 class _Paper:
-    """The text of the paper (section V-D.1) on a task."""
+    """Numbers that the paper's text (section V-D.1) gives for a task."""
 
     heading: str
     ours: float
-    """Success rate at N = 180 with 100 demonstrations, in percent."""
+    """The success rate of the SO(2) method at N = 180 with 100 demonstrations, in percent."""
     transporter_gain: float
-    """The advantage of the Equivariant Transporter on average, in points."""
+    """The advantage of the Equivariant Transporter over the SO(2) method, on average, in points."""
 
 
 PAPER = {
@@ -41,12 +41,12 @@ def protocol_page(
     cells: Sequence[str] = (),
     set_aside: Sequence[Run] = (),
 ) -> str:
-    """The whole page, in Markdown.
+    """Writes the whole page, in Markdown.
 
     Args:
-        runs: from `read_runs`; there may be none of a task, or none at all.
+        runs: the runs from `read_runs`; there may be none.
         link: the path from the page's folder to that of the table of runs.
-        cells: the sections of
+        cells: the sections from
             `kitting_drake.reproduction.paper.protocol_sections.protocol_sections`.
         set_aside: the runs that nobody can repeat, which are in no other table.
     """
@@ -90,7 +90,7 @@ def _success_table(runs: list[Run], paper: _Paper) -> str:
 
     def row(method: str, preset: str | None = None, count: int | None = None) -> list[str]:
         named = [METHODS.get(method, method), preset or "", str(count or "")]
-        # Methods without N, such as the exact oracle, have one figure for all.
+        # Methods without N, such as the exact oracle, have the same figure for all N.
         any_n = cells.get((method, preset, count, None), [])
         return named + [
             _cell(cells.get((method, preset, count, n), []) + any_n) for n in orientations
@@ -116,7 +116,8 @@ def _with_others(usual: Iterable[int], found: Iterable[int | None]) -> list[int]
 
 
 def _cell(runs: list[Run]) -> str:
-    # List all runs that differ only in their training: a selection could flatter the policy.
+    # List all runs that differ only in their training, because a selection could flatter the
+    # policy.
     return (
         "<br>".join(
             f"{_strict(run.summary)} / {_own(run.summary)}, {run.summary['episodes']}{_marks(run)}"
@@ -143,9 +144,10 @@ def _own(summary: dict[str, Any]) -> str:
 
 
 def _most_tested_run(runs: list[Run]) -> list[str]:
-    """Tables by category of the most tested network, or of the most tested run if there is none."""
+    """Writes tables by category, of the most tested network, or of the most tested run without
+    one."""
     learned = [run for run in runs if run.method in LEARNED]
-    # Not the best run, which may be the luckiest of those with few episodes.
+    # Do not take the best run, which may be the luckiest of those with few episodes.
     most = max(learned or runs, key=lambda run: (run.summary["episodes"], run.name))
     rows = [*most.summary["categories"].items(), ("all", most.summary)]
 
@@ -179,7 +181,7 @@ def _most_tested_run(runs: list[Run]) -> list[str]:
 
 
 def _causes(runs: list[Run]) -> list[str]:
-    """Why objects were no strict success: a row for each run, best first."""
+    """Writes why objects were no strict success: a row for each run, best first."""
     causes = list(dict.fromkeys(cause for run in runs for cause in run.summary["causes"]))
     rows = []
     for run in sorted(runs, key=lambda run: -run.summary["strict_success_rate"]):
@@ -237,7 +239,7 @@ def _commits(run: Run) -> list[str]:
 
 
 def _weights(run: Run) -> str:
-    """The first digits of the digest of its weights."""
+    """Returns the first digits of the digest of a run's weights."""
     return (run.summary.get("policy_digest") or "-").removeprefix("sha256 ")[:8]
 
 

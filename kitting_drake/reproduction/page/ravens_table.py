@@ -1,4 +1,4 @@
-"""The five Ravens tasks: the paper's numbers (table I) and our runs with default settings."""
+"""Writes the section on the five Ravens tasks: the paper's numbers (table I) and our runs."""
 
 from collections import defaultdict
 from collections.abc import Sequence
@@ -8,7 +8,7 @@ from kitting_drake.reproduction.page.runs import LEARNED, METHODS, Run
 from kitting_drake.tasks import RAVENS_TASKS
 
 TASKS = tuple(task.title for task in RAVENS_TASKS)
-"""In the order of table I."""
+"""The titles of the tasks, in the order of table I."""
 
 PAPER: dict[tuple[str, int], tuple[tuple[float, float, float], ...]] = {
     ("SO(2)-equivariant (ours)", 36): (
@@ -40,18 +40,18 @@ PAPER: dict[tuple[str, int], tuple[tuple[float, float, float], ...]] = {
         (16.6, 63.3, 75.0),
     ),
 }
-"""Success rates in percent after 1, 10 and 100 demonstrations, by method and N."""
+"""Success rates in percent after 1, 10 and 100 demonstrations, by method and N, from table I."""
 
 
 def in_ravens_table(run: Run) -> bool:
-    """Whether a run is of one of the default tasks, with refined actions."""
+    """Whether a run is of one of the five tasks in its default form, with refined actions."""
     if run.summary["task"] not in TASKS or run.departures:
         return False
     return run.method not in LEARNED or bool(run.detail("continuous"))
 
 
 def ravens_section(runs: Sequence[Run]) -> list[str]:
-    """The section on the five tasks; empty without runs of them.
+    """Writes the section on the five tasks; it is empty without runs of them.
 
     Args:
         runs: all runs; those that are not `in_ravens_table` are ignored.
@@ -73,7 +73,7 @@ def ravens_section(runs: Sequence[Run]) -> list[str]:
     rows = []
     for (method, orientations, count), found in sorted(cells.items(), key=str):
         name = METHODS.get(method, method)
-        # List all runs: a selection could flatter the policy.
+        # List all runs, because a selection could flatter the policy.
         values = ["<br>".join(found[task]) if task in found else "-" for task in TASKS]
         rows.append([name, str(orientations or ""), str(count or ""), *values])
     headings = ["method", "N", "demonstrations", *TASKS]

@@ -1,5 +1,7 @@
-"""The page of results, docs/results.md: the figures that matter, the departures from the paper, and
-how to reproduce both."""
+"""Writes the page of results, docs/results.md.
+
+It has the main figures, the departures from the paper, and how to reproduce both.
+"""
 
 from collections.abc import Sequence
 
@@ -11,13 +13,13 @@ from kitting_drake.reproduction.page.runs import Run
 def results_page(
     runs: Sequence[Run], link: str, fresh: Sequence[str] = (), paper: Sequence[str] = ()
 ) -> str:
-    """The whole page, in Markdown.
+    """Writes the whole page, in Markdown.
 
     Args:
-        runs: those that fill no cell, from `cell_results`.
+        runs: the runs that fill no cell, from `cell_results`.
         link: the path from the page's folder to that of the table of runs.
-        fresh: the sections of `kitting_drake.reproduction.paper.paper_sections.fresh_tools`.
-        paper: the sections of `kitting_drake.reproduction.paper.paper_sections.paper_sections`.
+        fresh: the sections from `kitting_drake.reproduction.paper.paper_sections.fresh_tools`.
+        paper: the sections from `kitting_drake.reproduction.paper.paper_sections.paper_sections`.
     """
     headline = [*pooled_section(runs), *fresh]
     if headline:

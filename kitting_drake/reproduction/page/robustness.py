@@ -1,4 +1,4 @@
-"""The table of `docs/robustness.md`: the effect of each perturbation on each policy."""
+"""Writes the tables of `docs/robustness.md`: the effect of each perturbation on each policy."""
 
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
@@ -25,29 +25,29 @@ _COLUMNS = {
     "shape_matching": "shape matching",
 }
 _COMPARED = ("generalist, minus unperturbed", "generalist, minus shape matching")
-"""The paired differences, in points, on the seeds that both ran."""
+"""The paired differences, in points, on the seeds that both runs have."""
 _TRIES = 2
 _FRAMES = 5
 """The number of images that are averaged in further rows."""
 _SEEDS = range(2870, 2895)
 """The seeds of all cells of the first table. They were unseen before their first run."""
 _FEWEST = 12
-"""Levels other than moderate need at least this many of these seeds, counted from the first."""
+"""The least number of these seeds, counted from the first, for levels other than moderate."""
 
 Key = tuple[str, str]
-"""A row of the table and a method."""
+"""A row of the table, and a method."""
 
 
 def robustness_table(runs: Sequence[Run]) -> str:
-    """Strict success on unseen toolsets, with two tries per tool and recovering policies.
+    """Writes the tables of strict success on unseen toolsets.
 
-    All runs of the first table use the same seeds. The second table has the other levels, on the
-    first of these seeds. The last table has the cells that ran on more seeds, with all their seeds:
-    a selection could flatter the policy.
+    Policies have two tries per tool and may recover. All runs of the first table use the same
+    seeds. The second table has the other levels, on the first of these seeds. The last table has
+    all seeds of the cells that ran on more seeds, because a selection could flatter the policy.
 
     Args:
-        runs: all runs. Runs of other scenarios or with other weights than the shipped ones are
-            ignored.
+        runs: all runs. Runs of other scenarios, and runs with other weights than the shipped ones,
+            are ignored.
 
     Raises:
         UserError: two runs of one cell share seeds.
@@ -99,9 +99,11 @@ def robustness_table(runs: Sequence[Run]) -> str:
 
 
 def _table(found: Mapping[Key, Sequence[Run]], labels: Sequence[str], counted: bool = False) -> str:
-    """A table with one row for each perturbation that was run.
+    """Writes a table with one row for each perturbation that was run.
 
     Args:
+        found: the runs by row and method.
+        labels: the labels of the rows.
         counted: whether cells have the number of objects.
     """
 
@@ -114,7 +116,7 @@ def _table(found: Mapping[Key, Sequence[Run]], labels: Sequence[str], counted: b
         return f"{text}, {objects}" if counted else text
 
     def outcomes(key: Key) -> dict[str, Any]:
-        # Older summaries lack outcomes.
+        # Summaries of older versions have no outcomes.
         return {
             "outcomes": [
                 item for run in found.get(key, ()) for item in run.summary.get("outcomes", ())
@@ -141,11 +143,12 @@ def _table(found: Mapping[Key, Sequence[Run]], labels: Sequence[str], counted: b
 
 
 def _needless_table(found: Mapping[Key, Sequence[Run]], labels: Sequence[str]) -> str:
-    """One row for each perturbation with distractors; empty without runs."""
+    """Writes a table with one row for each perturbation with distractors; it is empty without
+    runs."""
 
     def share(key: Key) -> str:
         summaries = [run.summary for run in found.get(key, ())]
-        # Older summaries lack the count.
+        # Summaries of older versions do not have this count.
         if not summaries or not all("needless_actions" in item for item in summaries):
             return "-"
         needless, every = (
@@ -169,7 +172,7 @@ def _check_seeds(found: Mapping[Key, Sequence[Run]]) -> None:
         if twice is not None:
             files = " and ".join(run.name for run in runs if twice in run.summary["seeds"])
             raise UserError(
-                f"{files} both hold seed {twice} of {_COLUMNS[method]}, {label}: delete one"
+                f"{files} both have seed {twice} of {_COLUMNS[method]}, {label}: delete one of them"
             )
 
 
@@ -186,13 +189,13 @@ def _is_other_level(label: str) -> bool:
 
 
 def _strict(run: Run) -> tuple[int, int]:
-    """The number of strictly successful objects, and of all objects."""
+    """Returns the number of objects that were placed strictly, and the number of all objects."""
     objects = sum(category["objects"] for category in run.summary["categories"].values())
     return round(run.summary["strict_success_rate"] * objects), objects
 
 
 def with_figures(page: str, figures: str) -> str:
-    """A page with the text between its two marks replaced.
+    """Replaces the text between the two marks of a page.
 
     Raises:
         UserError: the page lacks the marks.
@@ -200,18 +203,20 @@ def with_figures(page: str, figures: str) -> str:
     head, begin, rest = page.partition(_BEGIN)
     _, end, tail = rest.partition(_END)
     if not begin or not end:
-        raise UserError(f"the page on robustness lacks {_BEGIN.strip()} and {_END.strip()}")
+        raise UserError(
+            f"the page on robustness must have the marks {_BEGIN.strip()} and {_END.strip()}"
+        )
     return f"{head}{begin}{figures}{end}{tail}"
 
 
 def _shipped() -> dict[str, str | None]:
-    """The digests of the shipped weights, by method."""
+    """Returns the digests of the shipped weights, by method."""
     policies = {"generalist": Learned(weights=""), "so2": load_scenario(_UNSEEN).policy}
     return {method: policy.digest(SCENARIOS / "paper") for method, policy in policies.items()}
 
 
 def _expected() -> dict[str, dict[str, Any]]:
-    """The scenario of each row, as JSON values."""
+    """Returns the scenario of each row, as JSON values."""
     path, task = _UNSEEN, f"task: {{tries: {_TRIES}}}"
     one, more = f"{{{task}}}", f"{{{task}, sensor_noise: {{frames: {_FRAMES}}}}}"
     rows: dict[str, tuple[str, str | None]] = {_UNPERTURBED: (one, None)}

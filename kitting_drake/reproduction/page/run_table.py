@@ -1,10 +1,10 @@
-"""The files behind the pages of results: a table with one row per run, and a compressed file.
+"""Reads and writes the files behind the pages of results, which hold the summaries of all runs.
 
-`runs.csv` holds the short fields of the `summary.json` of `evaluate`. Fields of dictionaries in it
-have names such as `versions.drake`. An empty cell is a field that the run lacks.
-`episodes.jsonl.xz` has one line per run with the rest: `outcomes` (the success rate of each
-episode, and how each object ended), `categories` and `resolved_scenario`. Both together restore
-every summary.
+`runs.csv` has one row per run, with the short fields of the `summary.json` of `evaluate`. A field
+of a dictionary in it has a name such as `versions.drake`. An empty cell means that the run lacks
+the field. `episodes.jsonl.xz` is compressed and has one line per run with the other fields:
+`outcomes` (the success rate of each episode, and how each object ended), `categories` and
+`resolved_scenario`. The two files together hold every summary in full.
 """
 
 import csv
@@ -25,37 +25,37 @@ Summary = dict[str, Any]
 TABLE = "runs.csv"
 EPISODES = "episodes.jsonl.xz"
 _NAME = "run"
-"""The column, and the field of a line, with the name of the run."""
+"""The column of the table, and the field of a line, that has the name of the run."""
 _LONG = ("categories", "outcomes", "resolved_scenario")
-"""The fields in `EPISODES`."""
+"""The fields that are in `EPISODES` instead of the table."""
 
 
 def read_summaries(folder: Path) -> dict[str, Summary]:
-    """The summaries of all runs, by name; empty without files.
+    """Returns the summaries of all runs, by name; none without files.
 
     Raises:
-        UserError: a file is damaged, or both files do not have the same runs.
+        UserError: a file is damaged, or the two files do not have the same runs.
     """
     rows, lines = _read_table(folder / TABLE), _read_lines(folder / EPISODES)
     for name in sorted(rows.keys() ^ lines.keys()):
         has, lacks = (TABLE, EPISODES) if name in rows else (EPISODES, TABLE)
         raise UserError(
-            f"{folder / lacks} lacks the run '{name}' that {has} has: restore the files, or add "
-            "the run again, or remove it (--add, --remove)"
+            f"{folder / lacks} lacks the run '{name}', which {has} has: restore the files, or add "
+            "the run again (--add), or remove it (--remove)"
         )
     return {name: row | lines[name] for name, row in sorted(rows.items())}
 
 
 def add_run(folder: Path, name: str, summary: Mapping[str, Any]) -> None:
-    """Adds a run to both files, creating them if necessary.
+    """Adds a run to both files; creates them if necessary.
 
     Args:
         folder: the folder of the files.
         name: the name of the run.
-        summary: from `evaluate`.
+        summary: the summary from `evaluate`.
 
     Raises:
-        UserError: another run has that name, or a file is damaged.
+        UserError: another run has this name, or a file is damaged.
     """
     require_folder(folder)
     with alone_in(folder):
@@ -93,13 +93,13 @@ def _write(folder: Path, rows: Mapping[str, Summary], lines: Mapping[str, Summar
     writer = csv.DictWriter(table, [_NAME, *_columns(flat.values())], lineterminator="\n")
     writer.writeheader()
     writer.writerows({_NAME: name, **row} for name, row in flat.items())
-    # Write the table last: a run without a row can be detected, and added again.
+    # Write the table last, because a run without a row is detected and can be added again.
     write_atomically(folder / EPISODES, lzma.compress(text.encode()))
     write_atomically(folder / TABLE, table.getvalue())
 
 
 def _columns(rows: Iterable[Mapping[str, str]]) -> list[str]:
-    """The columns of all rows; a column that earlier rows lack follows its neighbour."""
+    """Returns the columns of all rows; a column that earlier rows lack follows its neighbour."""
     columns: list[str] = []
     for row in rows:
         place = 0
@@ -113,7 +113,7 @@ def _columns(rows: Iterable[Mapping[str, str]]) -> list[str]:
 
 
 def _flatten(value: Any, column: str = "") -> dict[str, str]:
-    """The cells of a value, by column."""
+    """Returns the cells of a value, by column."""
     if isinstance(value, dict) and value and not any("." in key for key in value):
         cells: dict[str, str] = {}
         for key, item in value.items():
@@ -123,7 +123,7 @@ def _flatten(value: Any, column: str = "") -> dict[str, str]:
 
 
 def _cell(value: Any, column: str) -> str:
-    """A value as JSON, or as plain text if that is unambiguous."""
+    """Returns a value as JSON, or as plain text if that is unambiguous."""
     if isinstance(value, str) and value and _value(value, column) == value:
         return value
     if column == "seeds" and value and value == list(range(value[0], value[-1] + 1)):
@@ -160,7 +160,7 @@ def _read_table(path: Path) -> dict[str, Summary]:
             raise ValueError("its last line is incomplete")
         for row in csv.DictReader(io.StringIO(content, newline=""), strict=True):
             name = row.pop(_NAME)
-            # Surplus cells are under the key None; missing cells have the value None.
+            # Surplus cells have the key None; missing cells have the value None.
             if not name or name in rows or None in (*row, *row.values()):
                 raise ValueError(f"the row '{name}' is repeated or has the wrong length")
             rows[name] = _unflatten(row)

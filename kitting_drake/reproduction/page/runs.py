@@ -1,4 +1,4 @@
-"""The runs behind the pages of results, and how they depart from the paper's tasks."""
+"""The runs behind the pages of results, and how they differ from the paper's tasks."""
 
 import json
 from collections.abc import Mapping
@@ -26,13 +26,13 @@ METHODS = {
     "quantized_oracle": "oracle, quantized",
     "oracle": "oracle, exact",
 }
-"""Names of methods in tables. Other methods keep their own names."""
+"""The names of methods in tables. Other methods keep their own names."""
 
 LEARNED = ("so2", "equivariant_transporter", "transporter")
 """The methods that the paper compares."""
 
 _NOT_THE_TASK = ("policy", "random_seed", "target_realtime_rate", "meshcat")
-"""The scenario fields in which runs of one task may differ."""
+"""The fields of a scenario in which runs of one task may differ."""
 
 _ADDED: dict[str, Any] = {
     "task.distractors": 0,
@@ -51,10 +51,10 @@ _ADDED: dict[str, Any] = {
     "sensor_noise.frames": 1,
     "end_at_success": False,
 }
-"""Fields that older runs lack, with the values that those used."""
+"""Fields that the summaries of older versions lack, with the values that those versions used."""
 
 _ADDED_WHOLE = ("sensor_noise", "appearance")
-"""Fields that older runs lack, and that have the scenario's defaults."""
+"""Fields that the summaries of older versions lack, and that have the scenario's defaults."""
 
 _HAND = (
     "planner.firm_grasp_force",
@@ -65,11 +65,12 @@ _HAND = (
     "planner.search.speed",
 )
 _EARLIER_HAND = "an earlier hand"
-"""The label of runs that lack these fields. In them the hand did not grip heavy objects more
-firmly, press objects down or search in a spiral. Grasps narrower than 3 mm counted as failed."""
+"""The label of runs whose summaries lack the planner's fields above. In them the hand did not grip
+heavy objects more firmly, press objects down or search in a spiral. Grasps narrower than 3 mm
+counted as failed."""
 
 _UNLIMITED_HAND = {"lower_speed": 0.08, "minimum_width": 0.0015}
-"""Former defaults of the planner, of runs in which no contact force ended an action."""
+"""The planner's defaults in runs in which no contact force ended an action."""
 
 _LIMITED_HAND = (
     "peak_grasp_force",
@@ -79,11 +80,11 @@ _LIMITED_HAND = (
     "touch_speed",
     "slow_margin",
 )
-"""Fields of the planner that these runs lack. They count as runs of the present hand; the page of
-results says how many they are."""
+"""Fields of the planner that the summaries of these runs lack. They count as runs of the present
+hand; the page of results says how many they are."""
 
 _MOST_SHOWN = 4
-"""The most differences of one run that are listed; further ones are counted."""
+"""The largest number of differences of one run that are listed. Further ones are only counted."""
 
 
 _KINDS: dict[str, Any] = {
@@ -105,7 +106,7 @@ class Run:
     summary: Summary
 
     def detail(self, key: str) -> Any:
-        """An entry of the policy's details; None if it is missing."""
+        """Returns an entry of the policy's details; None if it is missing."""
         return self.summary["policy_details"].get(key)
 
     @property
@@ -124,7 +125,7 @@ class Run:
 
     @property
     def label(self) -> str:
-        """The policy and the parameters that the paper varies, as text."""
+        """The policy, and the parameters that the paper varies, as text."""
         parts = [METHODS.get(self.method, self.method)]
         for key, text in (
             ("orientations", "N = {}"),
@@ -140,10 +141,12 @@ class Run:
 
     @cached_property
     def departures(self) -> list[str]:
-        """The fields, other than the policy, in which the run's scenario is not the expected one.
+        """The fields in which the run's scenario differs from the expected scenario, except the
+        policy.
 
-        For a task of the paper (the Ravens tasks included), this project's scenario for that task
-        is expected. For any other task the default scenario is, and the task is not compared.
+        For a task of the paper, including its Ravens tasks, the expected scenario is this project's
+        scenario for the task. For any other task it is the default scenario, and the task is not
+        compared.
         """
         found = self.summary["resolved_scenario"]
         for task in PAPER_TASKS.values():
@@ -171,18 +174,19 @@ class Run:
 
 
 def described(scenario: Scenario) -> dict[str, Any]:
-    """The scenario as JSON data."""
+    """Returns a scenario as JSON values."""
     fields = ChosenScenario(scenario, Path(), "", None).described
     return json.loads(json.dumps(fields, default=str))
 
 
 def scenario_differences(found: dict[str, Any], expected: dict[str, Any]) -> list[str]:
-    """The fields in which two scenarios (see `described`) differ, apart from the policy."""
+    """Returns the fields in which two scenarios (see `described`) differ, except the policy."""
     return _differences(_without(found), _without(expected))
 
 
 def _without(scenario: dict[str, Any], *more: str) -> dict[str, Any]:
-    # Older runs have no field `robot`: theirs is the floating hand, the default.
+    # The summaries of older versions have no field `robot`, and used the default: the floating
+    # hand.
     fields = {"robot": _defaults()["robot"]} | scenario | _translated(scenario.get("plant"))
     if has_unlimited_hand(fields):
         fields["planner"] = _with_present_hand(fields["planner"])
@@ -196,14 +200,17 @@ def has_unlimited_hand(scenario: Mapping[str, Any]) -> bool:
 
 
 def _with_present_hand(planner: dict[str, Any]) -> dict[str, Any]:
-    """An older run's planner; former defaults, and fields that it lacks, have present defaults."""
+    """Returns the planner of a run of an older version with today's defaults.
+
+    They replace the defaults of that version, and fill in the fields that it lacks.
+    """
     defaults = _defaults()["planner"]
     former = [key for key, value in _UNLIMITED_HAND.items() if planner.get(key) == value]
     return planner | {key: defaults[key] for key in (*_LIMITED_HAND, *former)}
 
 
 def _translated(plant: Any) -> dict[str, Any]:
-    """The fields of an older run's `plant`, under their present names."""
+    """Renames the fields of `plant` in a run of an older version to their present names."""
     if not isinstance(plant, dict) or "contact_approximation" not in plant:
         return {}
     defaults = _defaults()
@@ -235,7 +242,7 @@ def _added() -> dict[str, Any]:
 
 
 def _differences(found: Any, expected: Any, path: str = "") -> list[str]:
-    """The paths at which JSON values differ, with the values found there."""
+    """Returns the paths at which JSON values differ, with the values found there."""
     if found == expected:
         return []
     if not isinstance(found, Mapping) or not isinstance(expected, Mapping):
@@ -258,7 +265,7 @@ def _differences(found: Any, expected: Any, path: str = "") -> list[str]:
 
 
 def read_runs(folder: Path) -> list[Run]:
-    """All runs in a folder's table, sorted by name; the table may be empty.
+    """Returns all runs in a folder's table, sorted by name; the table may be empty.
 
     Raises:
         UserError: there is no table, a file is damaged, or a run is not from `evaluate`.
@@ -274,13 +281,13 @@ def read_runs(folder: Path) -> list[Run]:
 
 
 def read_evaluation(path: Path) -> Summary:
-    """The summary that `evaluate` wrote.
+    """Returns the summary that `evaluate` wrote.
 
     Args:
         path: the file, or the folder with its `summary.json`.
 
     Raises:
-        UserError: it is unreadable or not a summary.
+        UserError: the file is unreadable or not a summary.
     """
     path = path / "summary.json" if path.is_dir() else path
     try:
@@ -292,14 +299,14 @@ def read_evaluation(path: Path) -> Summary:
 
 
 def check_summary(summary: Any, where: str) -> None:
-    """Checks that a summary has the fields of `evaluate` with their types.
+    """Checks that a summary has the fields of `evaluate`, with their types.
 
     Args:
         summary: the content of a file, or of a row.
-        where: its origin, for the error.
+        where: its origin, for the error message.
 
     Raises:
-        UserError: a field is missing or of another kind.
+        UserError: a field is missing or of another type.
     """
     must = "it must be a summary.json of evaluate"
     for key, kind in _KINDS.items():

@@ -1,4 +1,4 @@
-"""The results of the cells of the paper's tables."""
+"""Finds the results of the cells of the paper's tables."""
 
 from __future__ import annotations
 
@@ -17,45 +17,47 @@ from kitting_drake.reproduction.paper.learning_rates import Rates
 from kitting_drake.reproduction.paper.paper_tables import paper_cells
 
 MISSING, TO_RUN_AGAIN = "-", "- ‡"
-"""Texts of a cell that was not run, and of one whose run is not reproducible."""
+"""The text of a cell that was not run, and that of a cell whose run is not reproducible."""
 
 
 @dataclass(frozen=True)
 class Result:
-    """A cell with its summary."""
+    """A cell with the summary of its run."""
 
     cell: Cell
     summary: Mapping[str, Any]
 
     @cached_property
     def text(self) -> str:
-        """The strict rate with its interval, and the rate by the paper's measure, in percent."""
+        """The strict success rate with its interval, and the success rate by the paper's measure,
+        in percent."""
         strict = rate_text(self.summary["strict_success_rate"], self.summary["strict_ci95"])
         return f"{strict} / {100 * self.summary['success_rate']:.1f}"
 
 
 class Divided(NamedTuple):
-    """The groups into which `cell_results` divides runs."""
+    """The three groups into which `cell_results` divides runs."""
 
     results: list[Result]
     """The results of cells, in the order of the cells."""
     others: list[Run]
     """The other runs, in their given order."""
     set_aside: list[Run]
-    """Runs from trees with uncommitted changes, of cells or not. No table may use them."""
+    """The runs from trees with uncommitted changes, whether of cells or not. No table may use
+    them."""
 
     @property
     def to_run_again(self) -> frozenset[str]:
-        """The names of the runs set aside."""
+        """The names of the runs that are set aside."""
         return frozenset(run.name for run in self.set_aside)
 
 
 def cell_results(runs: Sequence[Run], rates: Rates) -> Divided:
-    """Divides runs into those of cells and others. A run with the name of a cell must fit it.
+    """Divides runs into those of cells and others. A run with the name of a cell must fit the cell.
 
     Args:
-        runs: from `read_runs`.
-        rates: from `read_rates`.
+        runs: the runs from `read_runs`.
+        rates: the learning rates from `read_rates`.
 
     Raises:
         UserError: a run does not fit the cell of its name.
@@ -72,7 +74,7 @@ def cell_results(runs: Sequence[Run], rates: Rates) -> Divided:
 
 
 def absent_text(name: str, to_run_again: Collection[str]) -> str:
-    """The text for a cell without a result."""
+    """Returns the text for a cell without a result."""
     return TO_RUN_AGAIN if name in to_run_again else MISSING
 
 
@@ -80,7 +82,7 @@ def check_cell(cell: Cell, summary: Summary, rates: Rates) -> None:
     """Checks that a summary fits a cell.
 
     Raises:
-        UserError: it does not; says why.
+        UserError: it does not fit. The message says why.
     """
     try:
         departure = cell.departure(summary, rates)
@@ -90,8 +92,8 @@ def check_cell(cell: Cell, summary: Summary, rates: Rates) -> None:
         raise UserError(f"run '{cell.name}' is not a summary of evaluate: {error!r}") from error
     if departure is not None:
         raise UserError(
-            f"run '{cell.name}' is not that of the cell of this name ({departure}): give it "
-            "another name, or remove it (results --remove)"
+            f"run '{cell.name}' does not fit the cell of this name ({departure}): give it another "
+            "name, or remove it (results --remove)"
         )
 
 
@@ -99,14 +101,14 @@ def check_new_cell(cell: Cell, summary: Summary, rates: Rates) -> None:
     """Checks that a new summary may fill a cell.
 
     Raises:
-        UserError: it does not fit the cell, or cannot be repeated.
+        UserError: the summary does not fit the cell, or its run cannot be repeated.
     """
     check_cell(cell, summary, rates)
     commits = summary["commit"]
     if not is_reproducible(commits):
+        made = f"commit {commits}, with uncommitted changes" if commits else "an unknown commit"
         raise UserError(
-            f"run '{cell.name}' cannot fill the cell of this name: its episodes are of "
-            f"{f'commit {commits}, with uncommitted changes' if commits else 'an unknown commit'}; "
+            f"run '{cell.name}' cannot fill the cell of this name: its episodes are from {made}; "
             "commit the changes and evaluate into a fresh folder"
         )
     if summary["policy_details"].get("method") in LEARNED and not summary["policy_digest"]:

@@ -16,15 +16,15 @@ from kitting_drake.scenario.loader import load_scenario
 from kitting_drake.scenario.schema import Scenario
 
 ORIENTATIONS = (180, 36, 72, 120)
-"""N of figure 6, in order of importance."""
+"""The values of N in figure 6, in order of importance."""
 PRESET = "small"
 LEARNING_RATES = (1e-3, 3e-4, 3e-3)
-"""The learning rates to try. The SO(2) method uses the first one, and each baseline the one that is
+"""The learning rates to try. The SO(2) method uses the first. Each baseline uses the one that is
 best on validation scenes."""
 VALIDATE_EVERY = 250
 _EARLIER_RELEASE = ("planner.release_clearance: 0.006", "planner.open_width: 0.08")
-"""Fields of older runs of Ravens tasks, in which the jaws opened wider and the demonstrators were
-others."""
+"""Fields of the planner in older runs of Ravens tasks, in which the jaws opened wider and the
+demonstrators were different."""
 _NO_SEARCH = "planner: {search: {amplitude: 0.0, reach: 0.0}}"
 
 
@@ -34,25 +34,26 @@ class Task:
 
     name: str
     file: str
-    """The scenario file."""
+    """The scenario file of the task."""
     tested: str
     """The name of the evaluated scenario."""
     demonstrated: str
     """The name of the scenario of the demonstrations."""
     first_seed: int
     table: str = "6"
-    """The table of the task: `6` (figure 6), `I` (table I) or `fresh`."""
+    """The table to which the task belongs: `6` (figure 6), `I` (table I) or `fresh`."""
     episodes: int = 100
     steps: int = 1500
     more_steps: int = 0
-    """Additional steps for trainings with more labels or augmentation than the paper's."""
+    """Additional steps for trainings that use more labels or augmentation than the paper."""
     demonstrations: int = 100
-    """The most training demonstrations, from seed 10000 on; those for validation start at 20000."""
+    """The largest number of training demonstrations. Their seeds start at 10000, those for
+    validation at 20000."""
     validation: int = 24
     rates_from: str = "unseen"
     """The task on which the baselines' learning rates are chosen."""
     earlier: tuple[str, ...] = ()
-    """Differences from the present scenario that a run may have; see `Cell.is_earlier`."""
+    """Differences from the task's scenario that an older run may have; see `Cell.is_earlier`."""
 
 
 TASKS = {
@@ -97,10 +98,10 @@ TASKS = {
                 earlier=earlier,
             )
             # Palletizing has eighteen decisions per episode, so few episodes suffice for
-            # validation. It has many equally good places, which take more steps to learn.
-            # At the learning rate of figure 6, a baseline does worse on the pyramid and on
-            # align-box-corner. So these two tasks have their own learning rates. Palletizing has
-            # that of the pyramid.
+            # validation. It has many equally good places, so it takes more steps to learn.
+            # A baseline does worse on the pyramid and on align-box-corner at the learning rate that
+            # figure 6 uses. Therefore these two tasks have their own learning rates. Palletizing
+            # uses that of the pyramid.
             for name, scenario, episodes, steps, validation, rates_from, earlier in (
                 ("block_insertion", "BlockInsertion", 100, 1000, 24, "unseen", _EARLIER_RELEASE),
                 (
@@ -147,20 +148,20 @@ class Training:
     demonstrations: int
     seed: int = 0
     learning_rate: float | None = None
-    """If None, the SO(2) method uses the first of `LEARNING_RATES`, and a baseline the best one for
-    its `reference`."""
+    """The learning rate. None: the first of `LEARNING_RATES` for the SO(2) method, and for a
+    baseline the best one for its `reference`."""
     taken_only: bool = True
-    """Whether only the taken action is a label, as in the paper."""
+    """Whether only the action that was taken is a label, as in the paper."""
     rigid: bool = True
     """Whether the only augmentation is a rigid motion of the scene, as in the paper."""
     angle_only: bool = False
-    """Whether only the pick-angle network is trained; the others are those of `base`."""
+    """Whether only the pick-angle network is trained. The other networks are those of `base`."""
     times: int = 1
-    """A multiple of the usual number of steps."""
+    """The factor for the usual number of steps."""
     preset: str = PRESET
-    """The size of its networks."""
+    """The preset, which gives the size of the networks."""
     rotations: int | None = None
-    """The number of rotations in a step of the Transporter, as in `Networks`."""
+    """The number of rotations in a training step of the Transporter, as in `Networks`."""
 
     @property
     def base(self) -> Training | None:
@@ -173,14 +174,15 @@ class Training:
 
     @property
     def steps(self) -> int:
-        """The number of steps: the same for all methods, as in the paper; more with more labels."""
+        """The number of steps. It is the same for all methods, as in the paper; with more labels it
+        is larger."""
         task = TASKS[self.task]
         more = 0 if self.taken_only and self.rigid else task.more_steps
         return self.times * (task.steps + more)
 
     @property
     def name(self) -> str:
-        """The name of its folder, without the learning rate."""
+        """The name of the training's folder, without the learning rate."""
         kind = "" if self.taken_only and self.rigid else "_ours"
         if kind and self.taken_only:
             kind += "_taken_only"
@@ -201,12 +203,13 @@ class Training:
 
 
 def reference(training: Training) -> Training:
-    """The training that chooses the learning rate of a baseline. It has no rate of its own yet."""
+    """Returns the training that chooses the learning rate of a baseline. It has no rate of its own
+    yet."""
     return Training(TASKS[training.task].rates_from, training.method, 36, 100)
 
 
 def rates_key(chosen_by: Training) -> str:
-    """The key in `Rates` of a training of `reference`."""
+    """Returns the key in `Rates` of a training from `reference`."""
     return f"{chosen_by.task}_{chosen_by.method}"
 
 
@@ -216,22 +219,23 @@ class Cell:
 
     task: str
     policy: Training | str
-    """The training of its networks, or another policy as the YAML of a scenario."""
+    """The training of the policy's networks, or another policy as the YAML of a scenario."""
     orientations: int | None
-    """N at inference; None if the policy has none."""
+    """The number N of orientations at inference; None if the policy has none."""
     label: str = ""
-    """Distinguishes it from the paper's own cell with the same task, policy and N."""
+    """A label that distinguishes the cell from the paper's cell with the same task, policy and
+    N."""
     continuous: bool = False
     """Whether actions are refined beyond pixels and bins; the paper quantizes them."""
     fit_outlines: bool = False
     search: bool = False
-    """Whether the hand searches when an insertion is blocked; not in the paper."""
+    """Whether the hand searches when an insertion is blocked. In the paper it does not."""
     end_at_success: bool = False
     """Whether the episode ends as soon as the task is done, as in the paper."""
     recover: bool = False
     """Whether the policy corrects failed insertions, with two actions per object."""
     avoid_failed_picks: bool = False
-    """Whether failed picks are avoided; not in the paper."""
+    """Whether the policy avoids failed picks. In the paper it does not."""
 
     @property
     def name(self) -> str:
@@ -252,15 +256,15 @@ class Cell:
 
     @property
     def seeds(self) -> range:
-        """The seeds of its episodes, which are the same for all cells of a task."""
+        """The seeds of the episodes, which are the same for all cells of a task."""
         task = TASKS[self.task]
         return range(task.first_seed, task.first_seed + task.episodes)
 
     def scenario_text(self, weights: str) -> str:
-        """The YAML to merge over its scenario.
+        """Returns the YAML to merge over the task's scenario.
 
         Args:
-            weights: the weights file; unused without networks.
+            weights: the weights file; ignored for a policy without networks.
         """
         if isinstance(self.policy, str):
             policy = self.policy
@@ -284,10 +288,10 @@ class Cell:
         return f"{{{', '.join(parts)}}}"
 
     def departure(self, summary: Mapping[str, Any], rates: Rates | None = None) -> str | None:
-        """The reason why a summary does not fit this cell; None if it fits.
+        """Returns the reason why a summary does not fit this cell; None if it fits.
 
         Args:
-            summary: from `evaluate`.
+            summary: the summary from `evaluate`.
             rates: the costs of the baselines' learning rates, if known.
         """
         expected = _expected(self)
@@ -298,7 +302,8 @@ class Cell:
         if list(summary["seeds"]) != list(self.seeds):
             return f"its seeds are not {self.seeds[0]} to {self.seeds[-1]}"
         if isinstance(self.policy, str):
-            # Runs without this field avoided failed picks. The digest identifies the weights.
+            # Runs without this field avoided failed picks. The weights are identified by their
+            # digest.
             policies = (summary["resolved_scenario"]["policy"], expected["policy"])
             found, wanted = (
                 {"avoid_failed_picks": True} | policy | {"weights": ""} for policy in policies
@@ -308,7 +313,7 @@ class Cell:
             same = summary["policy_digest"] == _loaded(self).policy.digest(SCENARIOS / "paper")
             return None if same else "its weights are not those that come with the package"
         details = self._details(self.policy)
-        # Runs without this field avoided failed picks; the page estimates the effect.
+        # Runs without this field avoided failed picks; the page of results estimates the effect.
         earlier = {"angle_only": False, "avoid_failed_picks": self.avoid_failed_picks}
         found = earlier | {"rotations": None} | summary["policy_details"]
         key = rates_key(reference(self.policy))
@@ -320,7 +325,7 @@ class Cell:
         return None
 
     def is_earlier(self, summary: Mapping[str, Any]) -> bool:
-        """Whether a run of this cell used an earlier version of its task."""
+        """Whether a run of this cell used an earlier version of the cell's task."""
         return bool(scenario_differences(summary["resolved_scenario"], _expected(self)))
 
     def _details(self, training: Training) -> dict[str, Any]:
@@ -347,7 +352,7 @@ class Cell:
         elif training.method == "so2":
             wanted["learning_rate"] = LEARNING_RATES[0]
         if learned_at.table == "6":
-            # For tasks of the other tables, the task determines these two.
+            # For tasks of the other tables, the task determines these two fields.
             wanted |= {"taken_only": training.taken_only, "rigid": training.rigid}
         return wanted
 

@@ -1,4 +1,5 @@
-"""How the cells "as in the paper" depart from it, and the effect of each departure."""
+"""Writes how the cells "as in the paper" differ from the paper, and the effect of each
+difference."""
 
 from __future__ import annotations
 
@@ -46,14 +47,14 @@ _NOT_MEASURED = (
         "0.001 for ours, the best of three for others",
     ),
 )
-"""Rows of what departs: its name, how it is in the paper or in Ravens, and how it is here."""
+"""Rows on the differences: the name, how it is in the paper or in Ravens, and how it is here."""
 
 
 def departures(results: Mapping[str, Result]) -> str:
-    """The section, with its two tables.
+    """Writes the section, with its two tables.
 
     Args:
-        results: by the names of their cells.
+        results: the results by the names of their cells.
     """
     measured = [
         (
@@ -108,7 +109,8 @@ def departures(results: Mapping[str, Result]) -> str:
 def _compared(
     results: Mapping[str, Result], what: str, pairs: Mapping[str, tuple[str, str]]
 ) -> str:
-    """The differences of pairs of cells that have results, in points by the paper's measure."""
+    """Writes the differences between pairs of cells with results, in points by the paper's
+    measure."""
     found = []
     for label, (one, other) in pairs.items():
         if one in results and other in results:
@@ -119,7 +121,8 @@ def _compared(
 
 
 def _earlier_hand(results: Mapping[str, Result]) -> str:
-    """A paragraph on the cells that were run before contact forces were limited, if there are."""
+    """Writes a paragraph on the cells that were run without limits on contact forces, if there are
+    any."""
     found = [has_unlimited_hand(item.summary["resolved_scenario"]) for item in results.values()]
     if not any(found):
         return ""
@@ -127,7 +130,8 @@ def _earlier_hand(results: Mapping[str, Result]) -> str:
 
 
 def _memory(results: Mapping[str, Result]) -> str:
-    """The share of actions that the memory of failed grasps can have changed, by kind of task."""
+    """Writes by kind of task how many actions the memory of failed grasps can have changed, in
+    percent."""
     parts = []
     for label, is_kitting in (("kitting", True), ("Ravens", False)):
         found = [

@@ -1,4 +1,4 @@
-"""The section of the protocol on how much better one method is than another on the same seeds."""
+"""Writes the section on how much better one method is than another on the same seeds."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from kitting_drake.reproduction.paper.paper_tables import (
 
 
 def differences(results: Mapping[str, Result]) -> list[str]:
-    """The section; empty if no two cells can be compared."""
+    """Writes the section; it is empty if no two cells can be compared."""
     rows = []
     for name, result in results.items():
         for label, other in _rivals(result.cell):
@@ -51,8 +51,11 @@ def differences(results: Mapping[str, Result]) -> list[str]:
 
 
 def _means(results: Mapping[str, Result]) -> list[list[str]]:
-    """The mean differences between SO(2) and the Equivariant Transporter: over N of figure 6 if all
-    of its cells exist, and over the trainings that both have."""
+    """Returns rows with mean differences between SO(2) and the Equivariant Transporter.
+
+    One row is the mean over N of figure 6, if all of its cells exist. The other is the mean over
+    the trainings that both methods have.
+    """
     rows = []
     ours, theirs = LEARNED[:2]
     for task in FIGURE_6:
@@ -74,7 +77,7 @@ def _means(results: Mapping[str, Result]) -> list[list[str]]:
 def _mean_row(
     results: Mapping[str, Result], label: str, names: Sequence[Sequence[str]]
 ) -> list[str]:
-    """A row with `label` and the mean difference over pairs of cells."""
+    """Returns a row with `label` and the mean difference over pairs of cells."""
     pairs = [(results[one].summary, results[two].summary) for one, two in names]
     found = [mean_paired_difference(pairs, rate) for rate in (STRICT, OWN)]
     texts = [points_text(item) for item in found if item is not None]
@@ -82,7 +85,7 @@ def _mean_row(
 
 
 def _rivals(cell: Cell) -> list[tuple[str, str]]:
-    """The labels and names of the cells that a cell is compared with."""
+    """Returns the labels and names of the cells with which a cell is compared."""
     training = cell.policy
     if cell.label == "trained_at_36" and isinstance(training, Training):
         return [("trained at N = 180", f"{cell.task}_{training.method}_36_100")]

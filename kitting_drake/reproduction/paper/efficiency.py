@@ -1,4 +1,4 @@
-"""The section on figure 6(c), the cost of predicting the pick angle, from `benchmark networks`."""
+"""Writes the section on figure 6(c), the cost of predicting the pick angle."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from kitting_drake.reproduction.page.prose import prose
 from kitting_drake.reproduction.page.runs import LEARNED, METHODS
 
 EFFICIENCY = "networks.json"
-"""The file beside the results: a copy of the output of `benchmark networks`."""
+"""The file beside the results that is a copy of the output of `benchmark networks`."""
 
 
 def read_efficiency(folder: Path) -> dict[str, Any] | None:
-    """The measurements of `benchmark networks`; None without a file.
+    """Reads the measurements of `benchmark networks`; returns None without a file.
 
     Raises:
         UserError: the file is damaged.
@@ -30,12 +30,12 @@ def read_efficiency(folder: Path) -> dict[str, Any] | None:
         measured: dict[str, Any] = json.loads(path.read_text())
         efficiency_section(measured)
     except (OSError, ValueError, LookupError, TypeError) as error:
-        raise UserError(f"{path} is not a file of benchmark networks: delete it") from error
+        raise UserError(f"{path} was not written by benchmark networks: delete it") from error
     return measured
 
 
 def efficiency_section(measured: Mapping[str, Any]) -> str:
-    """The section of the page.
+    """Writes the section on figure 6(c).
 
     Args:
         measured: the result of `benchmark_networks`.
@@ -80,5 +80,5 @@ def efficiency_section(measured: Mapping[str, Any]) -> str:
 
 
 def _cost_text(row: Mapping[str, Any]) -> str:
-    """The parameters, and the time or the reason why it is missing."""
+    """Returns the parameters, and the time or the reason why it is missing."""
     return f"{count_text(row['parameters'])}, {row['skipped'] or seconds_text(row['seconds'])}"

@@ -1,8 +1,9 @@
-"""The number of actions that a policy's memory of failed grasps can have changed.
+"""Counts the actions that a policy's memory of failed grasps can have changed.
 
 Policies do not pick within 10 mm of a failed grasp of the same episode, unless `avoid_failed_picks`
-is false. The paper has no such memory. It can only change actions after the first failed grasp of
-an episode. Newer summaries count these actions; for older ones there are bounds.
+is false. The policies of the paper have no such memory. The memory can only change actions that
+come after the first failed grasp of an episode. Newer summaries count these actions; for older ones
+this module gives bounds.
 """
 
 from __future__ import annotations
@@ -24,13 +25,14 @@ _MOST_ACTIONS = {
     "!PalletizingBoxes": 30,
     "!StackBlockPyramid": 12,
 }
-"""The most actions of an episode, by task, for runs that do not count the actions after a failed
-grasp. On any other task it is one action per object."""
+"""The largest number of actions of an episode, by task, for runs whose summaries do not count their
+actions. On any other task it is one action per object."""
 
 
 @dataclass(frozen=True)
 class Changeable:
-    """How many actions the memory of failed grasps can have changed, and how many there were."""
+    """The number of actions that the memory of failed grasps can have changed, or its bounds, and
+    the number of all actions."""
 
     at_least: int
     at_most: int
@@ -52,18 +54,19 @@ class Changeable:
 
 
 def changeable(summary: Mapping[str, Any]) -> Changeable:
-    """Counts the actions that follow a failed grasp of the same episode, or bounds their number.
+    """Counts the actions after a failed grasp of the same episode, or gives bounds on their number.
 
-    Newer summaries have this count. An older one has only the number of failed grasps, F, in E
-    episodes. At most n = min(F, E) of these episodes have a failed grasp. The bounds are:
+    Newer summaries have this count. An older one has only the number F of failed grasps in E
+    episodes. At most n = min(F, E) of these episodes have a failed grasp. This gives two bounds:
 
-    - At least F - n actions: in each episode, every failed grasp after the first one counts.
-    - At most all actions of n episodes, except for the first action of each, which failed. In the
-      other episodes each placed object took an action, so the n episodes are those with the fewest
-      placed objects.
+    - At least F - n actions follow a failed grasp. In each episode, all failed grasps but the first
+    do.
+    - At most all actions of n episodes do, except the first action of each, which is the failed
+    one. In the other episodes each placed object took an action. So the bound is largest if the n
+    episodes are those with the fewest placed objects.
 
     Args:
-        summary: the summary that `evaluate` wrote of a learned policy. If it has no number of
+        summary: the summary that `evaluate` wrote for a learned policy. If it has no number of
             actions, each episode is assumed to have used as many as the task allows.
     """
     episodes = [item["objects"] for item in summary["outcomes"]]
@@ -88,7 +91,10 @@ def changeable(summary: Mapping[str, Any]) -> Changeable:
 
 
 def failed_grasps(results: Sequence[Result]) -> list[str]:
-    """The section: a row for each task and method, summed over the cells as in the paper."""
+    """Writes the section on failed grasps: a row for each task and method.
+
+    Each row is a sum over the cells with the paper's settings.
+    """
     sums: dict[tuple[str, str], list[Changeable]] = {}
     for result in results:
         if is_as_in_the_paper(result):

@@ -1,4 +1,5 @@
-"""The file of the baselines' learning rates, with their costs on validation scenes."""
+"""Reads and writes the file of the baselines' learning rates, with their costs on validation
+scenes."""
 
 import json
 import math
@@ -9,15 +10,15 @@ from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import write_json
 
 RATES = "learning_rates.json"
-"""The file beside the results."""
+"""The name of the file, which is beside the results."""
 
 Rates = Mapping[str, Mapping[str, float]]
-"""The cost on validation scenes by task and method (`rates_key`) and learning rate: in mm, or the
+"""The cost on validation scenes by training (`rates_key`) and learning rate. It is in mm, or the
 loss in nats on a Ravens task. It is infinite (null in the file) if training diverged."""
 
 
 def read_rates(folder: Path) -> dict[str, dict[str, float]]:
-    """The learning rates that have been tried; empty without a file.
+    """Returns the learning rates that have been tried; none without a file.
 
     Raises:
         UserError: the file is damaged.
@@ -52,5 +53,5 @@ def write_rates(folder: Path, rates: Rates) -> None:
 
 
 def best_rate(costs: Mapping[str, float]) -> str:
-    """The learning rate with the least cost."""
+    """Returns the learning rate with the least cost."""
     return min(costs, key=lambda rate: costs[rate])

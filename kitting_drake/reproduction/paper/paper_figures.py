@@ -1,4 +1,4 @@
-"""Figures 6(a) and 6(b) of the paper, and its table I as a figure, from `benchmark paper`."""
+"""Draws figures 6(a) and 6(b) of the paper, and its table I as a figure, from `benchmark paper`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _COLOURS = {10: "#009e73", 100: "#d55e00"}
-"""Green and orange, as in the paper, and for the colour-blind too."""
+"""Green and orange, as in the paper, which the colour-blind can distinguish."""
 _MARKERS = {"so2": "o", "equivariant_transporter": "s", "transporter": "^"}
 _STEP = 0.12
 """The distance between the markers of one N."""
@@ -28,7 +28,8 @@ _ROWS = {
     ("equivariant_transporter", 36): ("#0072b2", "s"),
     ("transporter", 36): ("#56646f", "^"),
 }
-"""The rows of table I, method and N, with their colours, for the colour-blind too, and markers."""
+"""The rows of table I (method and N), with markers and with colours that the colour-blind can
+distinguish."""
 _ROW_STEP = 0.19
 """The distance between the markers of one number of demonstrations."""
 _STYLE = {
@@ -39,9 +40,9 @@ _STYLE = {
     "axes.titlesize": 13,
     "lines.markersize": 8,
 }
-"""Readable at half the size of the picture."""
+"""A style that is readable at half the size of the picture."""
 _TOP = 102.5
-"""The upper end of an axis in percent. It is above 100, so that a marker at 100 is not cut off."""
+"""The upper end of an axis in percent. It is above 100, so that markers at 100 are not cut off."""
 
 
 def draw_figure_6(task: str, results: Mapping[str, Result]) -> bytes:
@@ -53,7 +54,7 @@ def draw_figure_6(task: str, results: Mapping[str, Result]) -> bytes:
 
     Args:
         task: `seen` or `unseen`.
-        results: by cell name.
+        results: the results by cell name.
     """
     # Import matplotlib lazily.
     import matplotlib
@@ -108,12 +109,12 @@ def _draw_marker(
 def draw_table_1(results: Mapping[str, Result]) -> bytes:
     """Draws the mean reward of each Ravens task over the number of demonstrations, as a PNG.
 
-    A filled marker is our result with its 95 % interval, a star our result with extensions, and a
-    hollow marker the paper's figure for the same cell. Cells without a run are left out, with the
-    paper's figure for them. A task without a run has no panel.
+    A filled marker is our result with its 95 % interval, a star is our result with extensions, and
+    a hollow marker is the paper's figure for the same cell. A cell without a run is left out, and
+    so is the paper's figure for it. A task without a run has no panel.
 
     Args:
-        results: by cell name.
+        results: the results by cell name.
     """
     # Import matplotlib lazily.
     import matplotlib
@@ -141,7 +142,7 @@ def draw_table_1(results: Mapping[str, Result]) -> bytes:
         axes = axes[0]
         for (column, task), axis in zip(columns.items(), axes, strict=True):
             _draw_task(axis, task, column, results)
-            # In two lines, as five tasks stand side by side.
+            # Break the titles into two lines, because five tasks stand side by side.
             axis.set_title("\n".join(task.replace("_", " ").rsplit(" ", 1)))
             axis.set_xticks(range(len(counts)), [str(count) for count in counts])
             axis.set_xlim(-0.5, len(counts) - 0.5)
@@ -155,7 +156,8 @@ def draw_table_1(results: Mapping[str, Result]) -> bytes:
 
 
 def _draw_task(axis: Axes, task: str, column: int, results: Mapping[str, Result]) -> None:
-    """The panel of a task: our cells, and the paper's figures beside those without extensions."""
+    """Draws the panel of a task: our cells, and the paper's figures for those without
+    extensions."""
     for index, ((method, n), (colour, marker)) in enumerate(_ROWS.items()):
         for place, count in enumerate(sorted(RAVENS_DEMONSTRATIONS)):
             where = place + _ROW_STEP * (index - (len(_ROWS) - 1) / 2)

@@ -1,5 +1,7 @@
-"""The sections of the page of results to compare with the paper: figure 6, table I, and how we
-depart from it. They use only the results of `benchmark paper` and `benchmark networks`."""
+"""Writes the sections of the page of results that compare with the paper: figure 6 and table I.
+
+They use only the results of `benchmark paper` and `benchmark networks`.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,8 @@ _HEADINGS = {"seen": "Seen toolset, figure 6(a)", "unseen": "Unseen toolsets, fi
 _TITLES = {"seen": "kitting-seen-toolset", "unseen": "kitting-unseen-toolsets"}
 
 EARLIER_MARK = " e"
-"""Marks numbers of table I whose runs had other task settings (see `Cell.is_earlier`)."""
+"""The mark of numbers of table I whose runs had other settings of the task (see
+`Cell.is_earlier`)."""
 
 
 def paper_sections(
@@ -42,10 +45,10 @@ def paper_sections(
     efficiency: Mapping[str, Any] | None = None,
     to_run_again: Collection[str] = (),
 ) -> list[str]:
-    """The sections of the page; none without results.
+    """Writes the sections; there are none without results.
 
     Args:
-        results: the results of `cell_results`.
+        results: the results from `cell_results`.
         efficiency: the result of `benchmark networks`; None without one.
         to_run_again: the names of the cells whose runs are set aside.
     """
@@ -68,7 +71,7 @@ def paper_sections(
 
 
 def has_figure(task: str, results: Sequence[Result]) -> bool:
-    """Whether there is something to draw: cells of both methods of a task's figure 6."""
+    """Whether there are cells of both methods of a task's figure 6, so that it can be drawn."""
     methods = {
         result.cell.policy.method
         for result in results
@@ -83,7 +86,7 @@ def has_table_1(results: Iterable[Result]) -> bool:
 
 
 def _state_text(results: Sequence[Result], to_run_again: Collection[str]) -> str:
-    """How many of the cells have been run, and what that took."""
+    """Says how many of the cells have been run, and how long that took."""
     cells = paper_cells()
     count, again = len(cells), sum(cell.name in to_run_again for cell in cells)
     hours = f"{sum(result.summary['wall_seconds'] for result in results) / 3600:.0f}"
@@ -137,8 +140,11 @@ def _table_1(results: Mapping[str, Result], again: Collection[str]) -> list[str]
 
 
 def rows_of_table_1() -> Iterator[tuple[str, int, dict[str, tuple[float, float, float]]]]:
-    """The rows of table I: a method, its N, and the paper's figures by task, after the numbers of
-    demonstrations in rising order."""
+    """Yields the rows of table I.
+
+    A row has a method, its N, and the paper's figures by task. The figures are in the order of
+    rising numbers of demonstrations.
+    """
     tasks = [task.name for task in TASKS.values() if task.table == "I"]
     for (name, n), by_task in TABLE_1.items():
         method = next(key for key, label in METHODS.items() if label == name)
@@ -148,7 +154,8 @@ def rows_of_table_1() -> Iterator[tuple[str, int, dict[str, tuple[float, float, 
 def ravens_text(
     name: str, paper: float, results: Mapping[str, Result], again: Collection[str]
 ) -> str:
-    """A cell of table I: our mean reward with its interval, and the paper's figure."""
+    """Returns the text of a cell of table I: our mean reward with its interval, and the paper's
+    figure."""
     found = results.get(name)
     if found is None:
         return f"{absent_text(name, again)} / {paper:g}"
@@ -158,10 +165,10 @@ def ravens_text(
 
 
 def fresh_tools(results: Sequence[Result], again: Collection[str] = ()) -> list[str]:
-    """The section on the ten fresh tools; nothing without a result on them.
+    """Writes the section on the ten fresh tools; there is none without a result on them.
 
     Args:
-        results: the results of `cell_results`.
+        results: the results from `cell_results`.
         again: the names of the cells whose runs are set aside.
     """
     by_name = {result.cell.name: result for result in results}
@@ -183,7 +190,8 @@ def fresh_tools(results: Sequence[Result], again: Collection[str] = ()) -> list[
 
 
 def both_rates(result: Result) -> list[str]:
-    """The strict rate, its interval over tools, and the rate by the paper's measure."""
+    """Returns the strict rate, its interval over tools, and the rate by the paper's measure, as
+    text."""
     summary = result.summary
     drawn = summary["resolved_scenario"]["task"]["_tag"] == "!ToolsetKitting"
     tools = over_tools(summary["outcomes"], STRICT) if drawn else None

@@ -1,4 +1,4 @@
-"""The cells of the paper's tables (figure 6, table I), of our ablation and of fresh tools."""
+"""Lists the cells of the paper's tables (figure 6, table I), of our ablation and of fresh tools."""
 
 from __future__ import annotations
 
@@ -19,34 +19,37 @@ FIGURE_6 = ("unseen", "seen")
 """The tasks of figure 6."""
 PATIENCE = 3
 PATIENT = f"{PATIENCE}_times_the_steps"
-"""The label of cells trained for `PATIENCE` times the usual steps."""
+"""The label of cells that were trained for `PATIENCE` times the usual number of steps."""
 FASTER = 3e-3
 AT_FASTER = f"learning_rate_{FASTER:g}"
-"""The label of SO(2) cells at the largest learning rate instead of the usual one."""
+"""The label of SO(2) cells that were trained with the largest learning rate instead of the usual
+one."""
 STEADIER = {
     ("palletizing_boxes", "equivariant_transporter", 10): 1e-3,
     ("palletizing_boxes", "equivariant_transporter", 1): 1e-3,
 }
-"""Learning rates by task, method and demonstrations, for trainings that diverge at the best rate of
-their `reference`. They take its second best rate. (With ten demonstrations, the pick-angle loss
-exploded.)"""
+"""Learning rates by task, method and number of demonstrations, for trainings that diverge at the
+best rate of their `reference`. They use its second-best rate. With ten demonstrations, the
+pick-angle loss diverged."""
 MATCHED = "matched"
-"""The preset in which baselines and SO(2) networks keep the same share of their originals'
-parameters; see `paper.parameter_table`."""
+"""The preset in which the baselines have the same share of their originals' parameters as the SO(2)
+networks; see `paper.parameter_table`."""
 ROTATIONS = 18
-"""The number of rotations, of 36, in a training step of the Transporter in `_every_chance`."""
+"""The number of rotations, of 36, in a training step of the Transporter in the cells of
+`_every_chance`."""
 EVERY_CHANCE = "every_chance"
-"""The label of those cells."""
+"""The label of the cells of `_every_chance`."""
 BEYOND_OF_TABLE_1 = ("stack_block_pyramid",)
-"""The tasks of table I that are also run with our extensions: those on which the published
-SO(2) method scores lower here than in the paper after ten or a hundred demonstrations."""
+"""The tasks of table I that are run with our extensions as well. On them, the published SO(2)
+method scores lower here than in the paper after ten or a hundred demonstrations."""
 
 
 def _paper_cell(
     task: str, method: str, n: int, demonstrations: int, seed: int = 0, times: int = 1
 ) -> Cell:
-    # Networks that do not depend on N are trained once, at the largest N: all SO(2) networks, and
-    # all Equivariant Transporter networks but the angle network. `_checks` verifies this.
+    # Networks that do not depend on N are trained once, at the largest N. These are all SO(2)
+    # networks, and all networks of the Equivariant Transporter but the pick-angle network.
+    # `_checks` verifies this.
     trained_at = ORIENTATIONS[0] if method == "so2" else n
     shared = (
         method == "equivariant_transporter" and n != ORIENTATIONS[0] and TASKS[task].table == "6"
@@ -78,7 +81,7 @@ def _figure_6() -> list[Cell]:
 
 
 def _checks() -> list[Cell]:
-    """Cells with all networks trained at the N of the test."""
+    """Returns cells whose networks are all trained at the N of the test."""
     trainings = [
         *(Training(task, "so2", 36, 100) for task in FIGURE_6),
         Training("unseen", "equivariant_transporter", 36, 100),
@@ -90,7 +93,8 @@ def _checks() -> list[Cell]:
 
 
 def _patient() -> list[Cell]:
-    """SO(2) with more steps than the other methods, on two tasks of table I."""
+    """Returns SO(2) cells with more training steps than the other methods, on two tasks of table
+    I."""
     return [
         _paper_cell(task, "so2", n, count, times=PATIENCE)
         for task, count in (("stack_block_pyramid", 100), ("place_red_in_green", 1))
@@ -99,9 +103,9 @@ def _patient() -> list[Cell]:
 
 
 def _faster() -> list[Cell]:
-    """SO(2) on the pyramid, at the best learning rate of the Equivariant Transporter there.
+    """Returns SO(2) cells on the pyramid, at the best learning rate of the Equivariant Transporter.
 
-    SO(2)'s own learning rate is not tuned.
+    The learning rate of SO(2) itself is not tuned.
     """
     own = (_paper_cell("stack_block_pyramid", "so2", n, 100) for n in (180, 36))
     return [
@@ -114,12 +118,12 @@ def _faster() -> list[Cell]:
 
 
 def headline(task: str, method: str, seed: int) -> Cell:
-    """A method's cell at N = 180 with 100 demonstrations, for one of `HEADLINE_SEEDS`."""
+    """Returns a method's cell at N = 180 with 100 demonstrations, for one of `HEADLINE_SEEDS`."""
     return _paper_cell(task, method, 180, 100, seed)
 
 
 def _headline_seeds() -> list[Cell]:
-    """The cells of all seeds but the first. Figure 6 has those of the first."""
+    """Returns the cells of all seeds but the first, whose cells belong to figure 6."""
     return [
         headline(task, method, seed)
         for seed in HEADLINE_SEEDS[1:]
@@ -129,7 +133,7 @@ def _headline_seeds() -> list[Cell]:
 
 
 def _ablation() -> list[Cell]:
-    """All our extensions, and all but one of them at a time."""
+    """Returns cells with all our extensions, and cells with all but one of them."""
 
     def ours(task: str, label: str, **changes: Any) -> Cell:
         kept = ("taken_only", "rigid")
@@ -161,10 +165,11 @@ def _ablation() -> list[Cell]:
 
 
 def _every_chance() -> list[Cell]:
-    """Cells that give the baselines every chance, on the tasks on which they score lower.
+    """Returns cells in which the baselines get larger networks and longer training.
 
-    Their networks keep the same share of the originals' parameters as the SO(2) networks. The
-    Transporter also learns from more rotations per step, in more steps.
+    They are on the tasks on which the baselines score lower than in the paper. The networks have
+    the same share of the originals' parameters as the SO(2) networks. The Transporter also learns
+    from more rotations per step, in more steps.
     """
     trainings = [
         *(
@@ -179,7 +184,7 @@ def _every_chance() -> list[Cell]:
             )
             for task in ("unseen", "stack_block_pyramid", "palletizing_boxes")
         ),
-        # The networks are those of the paper's cell, except for the pick-angle network.
+        # The networks are those of the paper's cell, except the pick-angle network.
         Training("unseen", "equivariant_transporter", 36, 100, angle_only=True, preset=MATCHED),
     ]
     return [
@@ -223,16 +228,16 @@ SHIPPED = {
     "shape_matching": "!ShapeMatching {}",
     "oracle": "!Oracle {}",
 }
-"""The shipped policies with all extensions; `!Learned {}` takes the scenario's weights."""
+"""The shipped policies with all extensions; `!Learned {}` uses the scenario's weights."""
 
 
 def _fresh_tools() -> list[Cell]:
-    """The shipped policies on unseen tools."""
+    """Returns the cells of the shipped policies on unseen tools."""
     return [Cell("fresh", policy, None, label, search=True) for label, policy in SHIPPED.items()]
 
 
 def paper_cells() -> list[Cell]:
-    """All cells, in order of importance."""
+    """Returns all cells, in order of importance."""
     return [
         *_figure_6()[:10],
         *_ablation()[:4],
@@ -249,7 +254,7 @@ def paper_cells() -> list[Cell]:
 
 
 def choose_cells(patterns: Sequence[str]) -> list[Cell]:
-    """The cells whose names match the patterns, in the order of the patterns.
+    """Returns the cells whose names match the patterns, in the order of the patterns.
 
     Raises:
         UserError: a pattern matches no cell.

@@ -1,4 +1,7 @@
-"""The table of the parameters of every network and its original, counted from the networks."""
+"""Writes the table of the parameters of every network and of its original.
+
+The parameters are counted from the networks.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,7 @@ from kitting_drake.reproduction.page.markdown import markdown_table
 from kitting_drake.reproduction.page.runs import LEARNED, METHODS
 
 ORIENTATIONS = 36
-"""N of the counted networks; only the Equivariant Transporter depends on it."""
+"""The N at which networks are counted. Only the Equivariant Transporter depends on it."""
 PRESETS = ("small", "matched", "paper")
 COLUMNS = ("alpha", "beta", "phi", "psi")
 ORIGINAL = {"alpha": 4_537_185, "beta": 835_888, "phi": 4_537_185, "psi": 4_537_185}
@@ -40,19 +43,20 @@ _ORIGINAL_TEXTS = {
     "so2": [*(f"{ORIGINAL[name]:,}" for name in COLUMNS), f"{sum(ORIGINAL.values()):,}"],
     "equivariant_transporter": ["4.54 M", "0.90 M", "4.54 M", "4.54 M", "14.5 M"],
 }
-"""The original parameters of each network and of all together, as text."""
+"""The numbers of parameters of the original networks, singly and together, as text."""
 
 
 @cache
 def count_parameters(method: str, preset: str) -> dict[str, int]:
-    """The number of parameters of each network.
+    """Counts the parameters of each network.
 
     Args:
         method: a key of `METHODS`.
         preset: the size of the networks.
 
     Returns:
-        Counts by the names in `COLUMNS`. The Transporter's f_pick is `alpha`; it has no `beta`.
+        The counts by the names in `COLUMNS`. The Transporter's f_pick is under `alpha`, and it has
+        no `beta`.
     """
     # Import torch lazily.
     from kitting_drake.policies.networks.architecture import NetworkConfig
@@ -67,13 +71,13 @@ def count_parameters(method: str, preset: str) -> dict[str, int]:
 
 
 def original_parameters(method: str) -> int:
-    """The number of parameters of all original networks of a method."""
+    """Returns the number of parameters of all original networks of a method."""
     counts = ORIGINAL if method == "so2" else count_parameters(method, "paper")
     return sum(counts.values())
 
 
 def parameters_section() -> str:
-    """The table and its text, in Markdown."""
+    """Writes the table and its text, in Markdown."""
     rows = []
     for method in LEARNED:
         by_counts: dict[tuple[int | None, ...], list[str]] = {}

@@ -1,5 +1,7 @@
-"""The part of the protocol on the cells of the paper's tables: how each was trained and tested, and
-how they differ."""
+"""Writes the part of the protocol on the cells of the paper's tables.
+
+It says how each cell was trained and tested, and how cells differ.
+"""
 
 from __future__ import annotations
 
@@ -47,19 +49,19 @@ _VARIANTS = {
     "without labels of later picks": "_minus_all_targets",
     "without curvature and reflection": "_minus_curvature",
 }
-"""Endings of the names of cells, by the label of their row."""
+"""The endings of the names of cells, by the label of their row."""
 
 _TOLD = ("trained_orientations", "steps", "learning_rate", "training_seed", "compute_type")
-"""The details of a policy that are columns of "Every cell"."""
+"""The details of a policy that are columns of the table "Every cell"."""
 
 
 def protocol_sections(
     results: Sequence[Result], rates: Rates, to_run_again: Collection[str] = ()
 ) -> list[str]:
-    """The sections of the protocol; none without results.
+    """Writes the sections of the protocol; there are none without results.
 
     Args:
-        results: the results of `cell_results`.
+        results: the results from `cell_results`.
         rates: the cost of each learning rate of each baseline on validation scenes.
         to_run_again: the names of the cells whose runs are set aside.
     """
@@ -99,13 +101,14 @@ def _rates_text(rates: Rates) -> str:
 
 
 def _baselines() -> list[Training]:
-    """The trainings that choose the learning rates: each baseline on each task of `rates_from`."""
+    """Returns the trainings that choose the learning rates: each baseline on each task of
+    `rates_from`."""
     tasks = dict.fromkeys(task.rates_from for task in TASKS.values())
     return [Training(task, method, 36, 100) for method in LEARNED[1:] for task in tasks]
 
 
 def _trainings(results: Mapping[str, Result], again: Collection[str]) -> list[str]:
-    """The variation between trainings; empty unless there is a second one."""
+    """Writes the variation between trainings; nothing unless there is a second training."""
     rows = []
     for task in FIGURE_6:
         for method in LEARNED[:2]:
@@ -128,7 +131,8 @@ def _trainings(results: Mapping[str, Result], again: Collection[str]) -> list[st
 
 
 def _mean_rates(results: Sequence[Result]) -> str:
-    """The mean of both rates, and its standard deviation where there are several."""
+    """Returns the means of both rates as text, with their standard deviations if there are
+    several."""
     texts = []
     for rate in (STRICT, OWN):
         percents = [100 * result.summary[rate] for result in results]
@@ -166,7 +170,7 @@ def _palletizing(results: Mapping[str, Result]) -> list[str]:
 
 
 def _pyramid(results: Mapping[str, Result], again: Collection[str]) -> list[str]:
-    """The tasks of `BEYOND_OF_TABLE_1` with extensions."""
+    """Writes the section on the tasks of `BEYOND_OF_TABLE_1` with extensions."""
     if not any(
         f"{task}_so2" in name and name.endswith("_ours")
         for name in results
@@ -194,7 +198,7 @@ def _pyramid(results: Mapping[str, Result], again: Collection[str]) -> list[str]
 
 
 def _toppled_boxes(results: Mapping[str, Result]) -> list[str]:
-    """Failures on palletizing after one demonstration, of the cells that were run."""
+    """Writes the failures on palletizing after one demonstration, for the cells that were run."""
     rows = []
     for method, n, _ in rows_of_table_1():
         result = results.get(f"palletizing_boxes_{method}_{n}_1")
@@ -247,6 +251,6 @@ def _every_cell(results: Sequence[Result]) -> str:
 
 
 def _causes(summary: Mapping[str, Any]) -> str:
-    """Causes of failures and of successes that are not strict, with their counts."""
+    """Returns the causes of failures, and of successes that are not strict, with their counts."""
     counts = {**summary["causes"], **summary["ambiguous"]}
     return ", ".join(f"{name} {count}" for name, count in counts.items() if count) or "-"

@@ -1,7 +1,7 @@
 """The queue of the paper's experiments: collects, trains and evaluates, cell by cell.
 
 It runs the project's own commands one at a time. These resume unfinished work, so the queue can be
-stopped and restarted at any time and repeats nothing.
+stopped and restarted at any time without repeating anything.
 """
 
 from __future__ import annotations
@@ -38,32 +38,34 @@ from kitting_drake.reproduction.paper.cells import (
 from kitting_drake.reproduction.paper.learning_rates import best_rate, read_rates, write_rates
 
 _PATIENCE = 60.0
-"""The time for a terminated command to exit, in s."""
+"""The time in which a terminated command may exit, in s."""
 _FIRST_SEED, _FIRST_VALIDATION_SEED = 10000, 20000
 _BEFORE = {"angle_only": False}
-"""The values of fields that summaries of older trainings lack."""
+"""The values of fields that the summaries of older trainings lack."""
 
 
 class Failed(Exception):  # noqa: N818  A cell failed, not the queue.
-    """A command of the project failed."""
+    """Raised if a command of the project failed."""
 
 
 @dataclass
 class Queue:
-    """Collects, trains and evaluates in one folder, and adds results to the table in another."""
+    """Collects, trains and evaluates in one folder, and adds results to the table in another
+    folder."""
 
     folder: Path
     results: Path
-    """The folder of the table of runs (`run_table`) and the learning rates."""
+    """The folder with the table of runs (`run_table`) and the learning rates."""
     console: Console
     workers: int = 1
-    """The number of episodes in parallel."""
+    """The number of episodes that run in parallel."""
     _wanted: dict[str, int] = field(default_factory=dict, init=False)
-    """The most training demonstrations of each task in this run."""
+    """The largest number of training demonstrations of each task in this run."""
     _collected: set[Path] = field(default_factory=set, init=False)
     """The folders of demonstrations that have been checked."""
     _failed: dict[Path, str] = field(default_factory=dict, init=False)
-    """The errors of commands that failed in this run, by folder; they are not tried again."""
+    """The errors of commands that failed in this run, by folder. These commands are not tried
+    again."""
 
     def run(self, cells: Sequence[Cell]) -> dict[str, str]:
         """Fills cells in order.
@@ -93,7 +95,7 @@ class Queue:
         return failures
 
     def pending(self, cells: Sequence[Cell]) -> list[Cell]:
-        """The cells without a repeatable run in the table.
+        """Returns the cells without a repeatable run in the table.
 
         Raises:
             UserError: the table is damaged, or a run does not fit its cell.
@@ -106,11 +108,12 @@ class Queue:
         return [cell for cell in cells if cell.name not in kept]
 
     def collect(self, task: Task, *, validation: bool) -> Path:
-        """The file of a task's demonstrations, for training or validation."""
+        """Returns the file of a task's demonstrations, for training or validation; collects missing
+        ones."""
         count = task.validation if validation else self._wanted.get(task.name, task.demonstrations)
         folder = self.folder / "demonstrations" / f"{task.name}{'_validation' * validation}"
         if folder not in self._collected:
-            # If all exist, the command checks that they belong to this task.
+            # If all demonstrations exist, the command checks that they belong to this task.
             self._command(
                 "collect",
                 SCENARIOS / task.file,
@@ -125,7 +128,8 @@ class Queue:
         return folder / "demonstrations.h5"
 
     def _needed(self, policy: Training | str) -> Iterator[Training]:
-        """The trainings of a policy: its own, its base, and the one for its learning rate."""
+        """Yields the trainings of a policy: its own, its base, and the one for its learning
+        rate."""
         if isinstance(policy, str):
             return
         yield policy
@@ -135,7 +139,7 @@ class Queue:
             yield reference(policy)
 
     def train(self, training: Training) -> Path:
-        """The weights file of a training."""
+        """Returns the weights file of a training; trains if it is missing."""
         rate = training.learning_rate or LEARNING_RATES[0]
         if _is_rate_chosen(training):
             rate = self._best_rate(reference(training))
@@ -170,7 +174,7 @@ class Queue:
         )
 
     def _best_rate(self, chosen_by: Training) -> float:
-        """The learning rate with the best validation result in a training of `reference`.
+        """Returns the learning rate with the best validation result in a training of `reference`.
 
         Each result is saved at once and not computed again.
         """
@@ -184,12 +188,12 @@ class Queue:
                 continue
             summary = json.loads(weights.with_name("summary.json").read_text())
             best = summary["best"]
-            # The criterion by which the checkpoint was chosen.
+            # Use the criterion by which the checkpoint was chosen.
             self._keep_rate(chosen_by, rate, best.get("loss", best["cost_mm"]))
         return float(best_rate(read_rates(self.results)[rates_key(chosen_by)]))
 
     def _untried(self, chosen_by: Training) -> list[float]:
-        """The learning rates that a training of `reference` has not tried."""
+        """Returns the learning rates that a training of `reference` has not tried."""
         tried = read_rates(self.results).get(rates_key(chosen_by), {})
         return [rate for rate in LEARNING_RATES if f"{rate:g}" not in tried]
 
@@ -212,7 +216,7 @@ class Queue:
             folder=folder,
         )
         text = (folder / "summary.json").read_text()
-        # Results contain no absolute paths.
+        # Do not store absolute paths in results.
         if weights is not None:
             name = str(weights.resolve().relative_to(self.folder.resolve()))
             text = text.replace(json.dumps(str(weights.resolve())), json.dumps(name))
@@ -229,15 +233,15 @@ class Queue:
         self._say(f"{cell.name}: {rate:.1f} % strict, {100 * summary['success_rate']:.1f} %")
 
     def _command(self, verb: str, *arguments: Any, folder: Path) -> None:
-        """Runs a command of the project, with its output in a folder and a log beside it.
+        """Runs a command of the project, with its output in a folder and a log beside the folder.
 
         Raises:
-            Failed: it failed, now or earlier in this run.
+            Failed: the command failed, now or earlier in this run.
         """
         if folder in self._failed:
             raise Failed(self._failed[folder])
         command = [sys.executable, "-m", f"kitting_drake.{verb}", *map(str, arguments)]
-        # The log is beside the folder, because commands reject folders with other files.
+        # Write the log beside the folder, because commands reject folders with other files.
         log_file = require_folder(folder.parent) / f"{folder.name}.log"
         with log_file.open("w") as log:
             process = subprocess.Popen(
@@ -245,7 +249,7 @@ class Queue:
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 text=True,
-                # Ctrl-C must reach only the queue, which terminates the command.
+                # Ctrl-C must reach only the queue, which then terminates the command.
                 start_new_session=True,
             )
             try:
@@ -262,7 +266,7 @@ class Queue:
 
 
 def _is_rate_chosen(training: Training) -> bool:
-    """Whether its learning rate is chosen by `reference`."""
+    """Whether the learning rate of a training is chosen by its `reference`."""
     return training.learning_rate is None and training.method != "so2"
 
 
@@ -285,7 +289,7 @@ def _check_training(training: Training, folder: Path) -> None:
 
 
 def _end(process: subprocess.Popen[str]) -> None:
-    """Terminates a command, which may save its state first."""
+    """Terminates a command, which may first save its state."""
     if process.poll() is None:
         process.terminate()
         try:
@@ -296,7 +300,7 @@ def _end(process: subprocess.Popen[str]) -> None:
 
 
 def run_paper(queue: Queue, cells: Sequence[Cell]) -> dict[str, str]:
-    """Fills cells with `Queue.run`. When stopped, it stops its child process too.
+    """Fills cells with `Queue.run`. If it is stopped, it also stops its child process.
 
     Returns:
         The reason for each cell that could not be filled, by name.
@@ -304,7 +308,7 @@ def run_paper(queue: Queue, cells: Sequence[Cell]) -> dict[str, str]:
     Raises:
         UserError: a result does not fit its cell.
     """
-    # A child that kept running would lock its folder against the next queue.
+    # Terminate the child, because it would otherwise lock its folder against the next queue.
     ended_by = (signal.SIGTERM, signal.SIGHUP)
     before = [signal.signal(number, lambda came, _: sys.exit(128 + came)) for number in ended_by]
     try:

@@ -1,1 +1,1 @@
-"""Simulated shifts: running them, their summary and report."""
+"""Simulated work shifts: runs them, and reports on them."""

@@ -1,12 +1,13 @@
-"""`benchmark endurance`: scene after scene, unattended, until a simulated shift is over.
+"""Runs scene after scene without a person, until a simulated work shift is over (`benchmark
+endurance`).
 
-A unit is a tool that is kitted strictly. An assist is one object that a person must mend at the end
-of a scene, because it is not kitted strictly: it lies where the policy gave up, is misplaced, or is
-off the table. In a scene that fails or times out, every object is one. The person mends while the
-kits are exchanged.
+A unit is a tool that is placed strictly. An assist is one object that a person must put right at
+the end of a scene, because it is not placed strictly: the policy gave it up, it is misplaced, or it
+is off the table. In a scene that fails or times out, every object is an assist. The person puts
+objects right while the kits are exchanged.
 
 A cycle is the simulated time from one unit to the next within a scene, failed actions included. The
-first begins with the scene, and a unit is finished when the hand has retreated.
+first cycle begins with the scene. A unit is finished when the hand has retreated.
 """
 
 import time
@@ -38,25 +39,26 @@ HOUR = 3600.0
 OFF_TABLE = "off the table"
 _LINES = "scenes.jsonl"
 _MOST_LOST = 20
-"""So many scenes in a row that never began end the shift."""
+"""The number of scenes in a row that cannot begin, after which the shift is aborted."""
 _BELOW = 0.05
-"""An object whose origin is this far below the table's top has fallen off it, in m."""
+"""The depth of an object's origin below the table's top, in m, at which it has fallen off the
+table."""
 _WIDTH = 0.5
-"""Width of the bins of the histogram of cycles, in s."""
+"""The width of the bins of the histogram of cycles, in s."""
 
 
 @dataclass
 class ShiftScene:
-    """A scene of the shift. The field names are keys of a line of `scenes.jsonl`."""
+    """A scene of the shift. Its field names are the keys of a line of `scenes.jsonl`."""
 
     seed: int
     sim_seconds: float
     tools: int
-    """The number of objects that a goal was left for."""
+    """The number of objects that had a free goal at the start."""
     unit_seconds: list[float] = field(default_factory=list)
-    """When each unit was finished, from the start of the scene."""
+    """The time at which each unit was finished, in s from the start of the scene."""
     assists: dict[str, str] = field(default_factory=dict)
-    """For each object to be mended, the cause."""
+    """The cause of each assist, by object."""
     actions: int = 0
     missed_grasps: int = 0
     dropped_objects: int = 0
@@ -67,7 +69,7 @@ class ShiftScene:
     commit: str | None = None
 
     def cycles(self) -> list[float]:
-        """Seconds of each unit."""
+        """The time of each unit's cycle, in s."""
         return np.diff(self.unit_seconds, prepend=0.0).tolist()
 
 
@@ -82,24 +84,24 @@ def run_shift(
     sent: ChosenScenario,
     console: Console,
 ) -> list[ShiftScene]:
-    """Runs the scenes of a shift that are not in `folder/scenes.jsonl`, and appends each.
+    """Runs the scenes of a shift that are not in `folder/scenes.jsonl`, and appends each of them.
 
     Args:
         chosen: the scenario.
-        hours: the simulated length of the shift. The scene that is under way then is finished.
+        hours: the simulated length of the shift. The scene in progress at its end is finished.
         exchange: the time between two scenes, in s.
         seed: the seed of the first scene; the others follow.
-        folder: the folder of the lines.
-        workers: run the scenes.
+        folder: the folder of `scenes.jsonl`.
+        workers: the processes that run the scenes.
         sent: the scenario with paths that are valid for the workers.
-        console: where to show progress.
+        console: the console for the progress.
 
     Returns:
         The scenes of the shift, in the order of the seeds.
 
     Raises:
-        UserError: the folder holds the scenes of another shift, a process was killed twice, or
-            many scenes in a row could not begin.
+        UserError: the folder holds the scenes of another shift, a process was killed twice, or many
+            scenes in a row could not begin.
     """
     identity = {**chosen.identity(), "first_seed": seed}
     claim_folder(folder, "scenario.json", identity, of="scenario, policy, version or first seed")
@@ -148,7 +150,7 @@ def _from(seed: int) -> Iterable[int]:
 def _shift(
     done: dict[int, ShiftScene], seed: int, wanted: float, exchange: float
 ) -> list[ShiftScene]:
-    """The scenes from the first seed on, without a gap, until the shift is over."""
+    """Returns the scenes from the first seed on, without a gap, until the shift is over."""
     scenes: list[ShiftScene] = []
     total = 0.0
     for number in _from(seed):
@@ -189,7 +191,7 @@ def _show(
 
 
 def _in_worker(workers: Workers, chosen: ChosenScenario, seed: int) -> ShiftScene:
-    """Runs a scene in another process; once more if that was killed from outside."""
+    """Runs a scene in another process, and once more if this process is killed from outside."""
     start = time.perf_counter()
     outcome = workers.run(_run_scene, chosen, seed)
     if isinstance(outcome, ProcessCrashed) and outcome.was_killed:
@@ -203,7 +205,8 @@ def _in_worker(workers: Workers, chosen: ChosenScenario, seed: int) -> ShiftScen
 
 
 def _lost(seed: int, why: str, wall_seconds: float = 0.0) -> ShiftScene:
-    """A scene of which only the reason of its failure is known. It is one assist."""
+    """Makes the line of a scene of which only the reason of its failure is known; it is one
+    assist."""
     scene = ShiftScene(seed, 0.0, tools=0, assists={"scene": FAILED}, failure=why)
     scene.wall_seconds, scene.commit = wall_seconds, commit()
     return scene
@@ -222,12 +225,13 @@ def _run_scene(chosen: ChosenScenario, seed: int) -> ShiftScene:
 
 
 class _Watch:
-    """An `EpisodeObserver` that notes when actions end and what has fallen off the table."""
+    """An `EpisodeObserver` that records when actions end and which objects have fallen off the
+    table."""
 
     def __init__(self, station: KittingStation) -> None:
         self._station = station
         self.ends: list[float] = []
-        """When the hand had retreated after each action, in s."""
+        """The time at which the hand had retreated after each action, in s."""
         self.off_table: set[str] = set()
 
     def observe(self, event: ModeChange) -> None:
@@ -246,7 +250,7 @@ class _Watch:
 
 
 def is_on_table(p_WB: Any) -> bool:
-    """Whether a point (3) is over the table and not below it; also false for NaN."""
+    """Whether a point (3,) is over the table and not below its top; false for NaN."""
     low, high = TABLE
     return bool(np.all(p_WB[:2] >= low) and np.all(p_WB[:2] <= high) and p_WB[2] > -_BELOW)
 
@@ -254,11 +258,11 @@ def is_on_table(p_WB: Any) -> bool:
 def shift_scene(
     result: EpisodeResult, ends: Sequence[float], off_table: Iterable[str] = ()
 ) -> ShiftScene:
-    """The line of a scene.
+    """Makes the line of a scene.
 
     Args:
-        result: of its episode.
-        ends: when each action was finished, in s.
+        result: the result of the scene's episode.
+        ends: the time at which each action was finished, in s.
         off_table: the names of the objects that lie off the table.
     """
     counted = [item for item in result.objects if item.add_s_mm is not None]
@@ -297,13 +301,13 @@ def _cause(item: ObjectResult, off_table: Iterable[str]) -> str:
 def summarise_shift(
     scenes: Sequence[ShiftScene], chosen: ChosenScenario, exchange: float
 ) -> dict[str, Any]:
-    """The content of `endurance.json`.
+    """Returns the content of `endurance.json`.
 
-    Rates count the whole shift, exchanges of kits included. The 95 % interval of the time between
-    assists holds if assists come independently (Poisson).
+    Rates are over the whole shift, including the exchanges of kits. The 95 % interval of the time
+    between assists assumes that assists are independent (a Poisson process).
 
     Args:
-        scenes: of the shift; at least one.
+        scenes: the scenes of the shift; at least one.
         chosen: the scenario.
         exchange: the time between two scenes, in s.
     """
@@ -345,14 +349,14 @@ def summarise_shift(
 
 
 def _between(minutes: float, assists: int) -> list[float | None]:
-    """The exact 95 % interval of the minutes between events of a Poisson process."""
+    """Returns the exact 95 % interval of the minutes between events of a Poisson process."""
     most = stats.chi2.ppf(0.975, 2 * assists + 2) / 2
     least = stats.chi2.ppf(0.025, 2 * assists) / 2 if assists else 0.0
     return [float(minutes / most), float(minutes / least) if least else None]
 
 
 def _distribution(cycles: Any) -> dict[str, Any]:
-    """Median, 95th percentile and a histogram of cycles in s."""
+    """Returns the median, the 95th percentile and a histogram of cycles, in s."""
     if not len(cycles):
         return {"median": None, "p95": None, "max": None, "bin_width": _WIDTH, "histogram": []}
     bins = np.bincount((cycles / _WIDTH).astype(int))

@@ -1,4 +1,4 @@
-"""The table and figure of `benchmark endurance`."""
+"""Makes the table and the figure of `benchmark endurance`."""
 
 import io
 from collections import Counter
@@ -16,11 +16,11 @@ _COLOURS = ("#d55e00", "#cc79a7", "#e69f00", "#8c6d1f", "#56b4e9", "#009e73", "#
 _MARKERS = "ov^sDPX*"
 _LINE = "#0072b2"
 _SHOWN = 0.995
-"""The share of cycles that the histogram's axis shows; longer ones are counted in its last bar."""
+"""The share of cycles on the histogram's axis. Longer cycles are counted in its last bar."""
 
 
 def endurance_table(measured: dict[str, Any]) -> Table:
-    """The measurements as a table for the terminal."""
+    """Makes a table of the measurements."""
     table = Table(
         title=f"{measured['scenario']} by {measured['policy']['name']}", title_justify="left"
     )
@@ -51,11 +51,11 @@ def _number(value: float | None, form: str = ".1f") -> str:
 
 
 def draw_endurance(measured: dict[str, Any], scenes: Sequence[ShiftScene]) -> bytes:
-    """Draws the units over time with each assist marked, and the histogram of cycles.
+    """Draws the units over time, with each assist marked, and the histogram of cycles.
 
     Args:
-        measured: by `summarise_shift`.
-        scenes: of the shift.
+        measured: the result of `summarise_shift`.
+        scenes: the scenes of the shift.
 
     Returns:
         A PNG.

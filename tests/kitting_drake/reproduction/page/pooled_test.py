@@ -54,5 +54,5 @@ def test_other_runs_are_ignored(other: Run):
 
 
 def test_a_seed_in_two_runs_is_an_error():
-    with pytest.raises(UserError, match="from_0 and from_3 both hold seed 3"):
+    with pytest.raises(UserError, match="from_0 and from_3 both have seed 3"):
         pooled_section([run([2], range(4)), run([2], range(3, 9))])

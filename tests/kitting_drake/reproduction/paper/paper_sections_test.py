@@ -216,7 +216,7 @@ def test_a_run_that_does_not_fit_its_name_is_rejected(runs: tuple[Run, ...]):
         return [Run(good.name, {**good.summary, **fields})]
 
     scenario = {**good.summary["resolved_scenario"], "cameras": {}}
-    said = r"run 'unseen_so2_180_100' is not that of the cell of this name \(camer"
+    said = r"run 'unseen_so2_180_100' does not fit the cell of this name \(camer"
     with pytest.raises(UserError, match=said):
         cell_results(spoiled(resolved_scenario=scenario), {})
     with pytest.raises(UserError, match="outcomes"):
