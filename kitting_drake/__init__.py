@@ -1,4 +1,4 @@
-"""Robotic kitting in Drake: the station, the tasks, the dataset and the policies."""
+"""Robotic kitting in Drake: the station, the tasks, the data set and the policies."""
 
 import itertools
 import sys
@@ -19,5 +19,5 @@ if any(
     flag == "-m" and module.startswith("kitting_drake")
     for flag, module in itertools.pairwise(sys.orig_argv)
 ):
-    # Ctrl-C may arrive while a command still imports modules.
+    # Install the handler now, because Ctrl-C may arrive while a command still imports modules.
     sys.excepthook = _end_quietly

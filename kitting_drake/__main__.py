@@ -9,15 +9,15 @@ VERBS = {
     "run": "run one episode, show it in Meshcat, save a replay",
     "evaluate": "run many seeds in parallel and summarise them",
     "collect": "collect demonstrations of the oracle in one file",
-    "draw_scenes": "draw static scenes of random tools, to train without physics",
+    "draw_scenes": "draw static scenes of random tools, for training without physics",
     "train": "train networks from demonstrations or static scenes",
     "decide": "decide one pick and place from a real camera's frames",
     "demonstrate": "convert frames and actions of a real bench to demonstrations",
-    "hkd": "manage tools and kits: list, sheet, build, import, annotate, kit",
+    "hkd": "manage tools and kits: list, sheet, build, import, trace, annotate, kit",
     "results": "write the pages of results from the table of runs",
     "benchmark": "measure run times, recovery, agreement with MuJoCo, the paper's tables",
 }
-"""The help text of each verb."""
+"""The verbs, with their help texts."""
 
 
 def main() -> None:
@@ -39,7 +39,7 @@ def main() -> None:
     name = f"kitting_drake.{verb}" + (".__main__" if verb == "hkd" else "")
     sys.argv = [f"kitting-drake {arguments[0]}", *arguments[1:]]
     try:
-        # Import only what the verb needs.
+        # Import only the modules that the verb needs.
         module = importlib.import_module(name)
         run_command = importlib.import_module("kitting_drake.common.command_line").run_command
     except KeyboardInterrupt:

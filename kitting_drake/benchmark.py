@@ -70,7 +70,7 @@ def _parser() -> argparse.ArgumentParser:
         add(benchmarks)
     for benchmark in benchmarks.choices.values():
         benchmark.add_argument(
-            "--output", type=Path, default=Path("output/benchmark"), help="folder for the files"
+            "--output", type=Path, default=Path("output/benchmark"), help="the folder for the files"
         )
         benchmark.add_argument("--quiet", action="store_true", help="print nothing but errors")
     return parser
@@ -78,7 +78,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def _add_simulation(benchmarks: Any) -> None:
     simulation = benchmarks.add_parser(
-        "simulation", help="times of an episode's phases, start-up and images"
+        "simulation", help="run times: phases of an episode, start-up, and images"
     )
     simulation.add_argument("--episodes", type=count_type, default=3, help="number of episodes (3)")
     simulation.add_argument(
@@ -89,7 +89,7 @@ def _add_simulation(benchmarks: Any) -> None:
 def _add_networks(benchmarks: Any) -> None:
     networks = benchmarks.add_parser(
         "networks",
-        help="sizes and run times of the networks, and lower bounds of the times",
+        help="sizes and run times of the networks, with lower bounds of the times",
     )
     networks.add_argument("--preset", default="small", help="size of the networks (small)")
     networks.add_argument(
@@ -112,7 +112,7 @@ def _add_kits(benchmarks: Any) -> None:
 
 def _add_fits(benchmarks: Any) -> None:
     fits = benchmarks.add_parser(
-        "fits", help="strict success and peak force against the clearance; resumes"
+        "fits", help="strict success and peak force against the cavities' clearance; resumes"
     )
     fits.add_argument(
         "--episodes", type=count_type, default=5, help="episodes of four tools per condition (5)"
@@ -131,7 +131,8 @@ def _add_recovery(benchmarks: Any) -> None:
 
 def _add_endurance(benchmarks: Any) -> None:
     endurance = benchmarks.add_parser(
-        "endurance", help="a simulated shift: units an hour, time between assists, cycle times"
+        "endurance",
+        help="a simulated work shift: units per hour, time between assists, cycle times",
     )
     add_scenario_flags(endurance)
     endurance.add_argument(
@@ -171,13 +172,16 @@ def _add_reliability(benchmarks: Any) -> None:
         "reliability", help="whether a decision's confidence is its probability of success"
     )
     reliability.add_argument(
-        "--scenes", type=count_type, default=100, help="number of drawn scenes (100)"
+        "--scenes", type=count_type, default=100, help="number of scenes (100)"
     )
     reliability.add_argument(
-        "--seed", type=seed_type, default=900_000, help="seed of the first scenes (900000)"
+        "--seed", type=seed_type, default=900_000, help="seed of the first scene (900000)"
     )
     reliability.add_argument(
-        "--weights", type=Path, metavar="FILE", help="of the networks (default: the generalist)"
+        "--weights",
+        type=Path,
+        metavar="FILE",
+        help="weights of the networks (default: the generalist)",
     )
     reliability.add_argument(
         "--fit",
@@ -191,12 +195,17 @@ def _add_trace(benchmarks: Any) -> None:
         "trace", help="error of the outlines that `hkd trace` finds in drawn photos of tools"
     )
     tracing.add_argument(
-        "--tools", nargs="+", metavar="NAME", help="tools, three photos of each (default: 20)"
+        "--tools",
+        nargs="+",
+        metavar="NAME",
+        help="names of the tools, of which three photos each are drawn (default: 20 tools)",
     )
     tracing.add_argument(
-        "--no-exif", action="store_true", help="the photos do not tell their focal length"
+        "--no-exif", action="store_true", help="draw photos that do not state their focal length"
     )
-    tracing.add_argument("--keep", action="store_true", help="keep the photos and the pictures")
+    tracing.add_argument(
+        "--keep", action="store_true", help="a folder in which to keep the photos and the pictures"
+    )
 
 
 def _add_reach(benchmarks: Any) -> None:
@@ -207,13 +216,13 @@ def _add_reach(benchmarks: Any) -> None:
         "--robot",
         type=Path,
         metavar="ROBOT.yaml",
-        help="model and base of the arm (default: those of !FrankaArm)",
+        help="a file with the arm's model and base (default: those of !FrankaArm)",
     )
     reach.add_argument(
         "--camera",
         type=Path,
         metavar="CALIBRATION.yaml",
-        help="its workspace is used (default: the cell's)",
+        help="a calibration whose workspace is used (default: the simulated cell's)",
     )
 
 
@@ -226,14 +235,14 @@ def _add_paper(benchmarks: Any) -> None:
         nargs="+",
         default=["*"],
         metavar="PATTERN",
-        help="names of the cells, in this order (*: all, the most informative first)",
+        help="names of the cells, in this order (default *: all, the most informative first)",
     )
     paper.add_argument(
         "--results",
         type=Path,
         metavar="DIR",
         default=Path("docs/results"),
-        help="folder of the table of runs, which finished cells are added to (docs/results)",
+        help="folder of the table of runs, to which finished cells are added (docs/results)",
     )
     paper.add_argument("--workers", type=count_type, default=1, help="parallel episodes (1)")
 
@@ -249,7 +258,7 @@ def _duration(text: str) -> float:
     return duration
 
 
-# Each benchmark imports its own modules lazily.
+# Each benchmark imports its modules lazily.
 
 
 def _simulation(arguments: argparse.Namespace, console: Console, folder: Path) -> list[Table]:
@@ -300,7 +309,7 @@ def _networks(arguments: argparse.Namespace, console: Console, folder: Path) -> 
 
 
 def _recovery(arguments: argparse.Namespace, console: Console, folder: Path) -> int:
-    """Measures recovery; returns the exit code."""
+    """Measures the recovery from failed actions; returns the exit code."""
     from kitting_drake.reproduction.benchmarks.recovery_benchmark import (
         benchmark_recovery,
         recovery_table,
@@ -337,7 +346,7 @@ def _reach(arguments: argparse.Namespace, console: Console, folder: Path) -> lis
 
 
 def _endurance(arguments: argparse.Namespace, console: Console, folder: Path) -> int:
-    """Runs a shift; returns the exit code."""
+    """Runs a simulated work shift; returns the exit code."""
     from kitting_drake.episode.chosen import build_any_chosen
     from kitting_drake.reproduction.benchmarks.shift.endurance import run_shift, summarise_shift
     from kitting_drake.reproduction.benchmarks.shift.endurance_report import (
@@ -348,10 +357,10 @@ def _endurance(arguments: argparse.Namespace, console: Console, folder: Path) ->
     chosen = choose_scenario(arguments)
     seed = chosen.scenario.random_seed if arguments.seed is None else arguments.seed
     if arguments.hours == 0.0:
-        raise UserError("--hours is 0: use a positive number")
+        raise UserError("--hours is 0: give a positive number")
     if note := uncommitted_note():
         console.print(f"note: {note}", highlight=False, markup=False)
-    # Fail early if no scene can be built.
+    # Report a scene that cannot be built before the shift starts.
     build_any_chosen(chosen, range(seed, seed + 5))
     with alone_in(folder), open_workers(arguments, chosen) as (workers, sent):
         scenes = run_shift(
@@ -430,7 +439,8 @@ def _paper(arguments: argparse.Namespace, console: Console, folder: Path) -> int
 
 
 def _use_one_core() -> None:
-    """Restricts this process and its children to one core: the tables give times on one core."""
+    """Restricts this process and its children to one core, because the tables give times on one
+    core."""
     os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
 
 

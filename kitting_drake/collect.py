@@ -84,16 +84,18 @@ def main() -> int:
         console.print(f"note: {note}", highlight=False, markup=False)
     start = time.perf_counter()
     with alone_in(folder):
-        # Fail early, before claiming the folder.
+        # Check this before claiming the folder.
         if not chosen.scenario.cameras:
-            raise UserError(f"{chosen.path}: cameras is empty: collect needs at least one")
+            raise UserError(
+                f"{chosen.path}: cameras is empty, and collect needs at least one camera"
+            )
         require_rendering()
         build_any_chosen(chosen, seeds_from(arguments.seed))
         export = _Export.of(arguments, chosen, folder) if arguments.export else None
         identity = {
             **chosen.described,
             "versions": versions(),
-            # The user may import or annotate a tool again.
+            # Detect tools that the user imported or annotated again.
             "task_digest": files_digest(chosen.scenario.task.input_files(chosen.base)),
         }
         claim_folder(folder, "scenario.json", identity, of="scenario, tools or version")
@@ -126,28 +128,28 @@ def _add_export_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--export",
         choices=("lerobot",),
-        help="also record frames, and write them as a LeRobotDataset v3.0 to the folder lerobot in "
-        "--output",
+        help="also record frames, and write them as a LeRobotDataset v3.0 to the folder lerobot "
+        "in --output",
     )
     parser.add_argument(
         "--fps",
         type=count_type,
         default=DEFAULT_RATE,
-        help=f"frames per simulated second, {RATES[0]} to {RATES[-1]} ({DEFAULT_RATE})",
+        help=f"frames per simulated second, {RATES[0]} to {RATES[-1]} (default: {DEFAULT_RATE})",
     )
     parser.add_argument(
         "--cameras",
         nargs="+",
         default=(),
         metavar="NAME",
-        help="cameras whose images are exported (all)",
+        help="cameras whose images are exported (default: all)",
     )
     parser.add_argument(
         "--image_width",
         type=count_type,
         default=DEFAULT_WIDTH,
         metavar="PIXELS",
-        help=f"largest width of the exported images ({DEFAULT_WIDTH})",
+        help=f"largest width of the exported images in pixels (default: {DEFAULT_WIDTH})",
     )
     parser.add_argument(
         "--instruction",
@@ -158,7 +160,8 @@ def _add_export_flags(parser: argparse.ArgumentParser) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class _Export:
-    """Frames of the demonstrations in `frames/`, and the dataset made of them in `lerobot/`."""
+    """The export of frames: those of the demonstrations in `frames/`, and the dataset in
+    `lerobot/`."""
 
     folder: Path
     frames: Path
@@ -167,7 +170,7 @@ class _Export:
 
     @staticmethod
     def of(arguments: argparse.Namespace, chosen: ChosenScenario, folder: Path) -> "_Export":
-        """Checks the flags, before anything is written.
+        """Checks the flags before anything is written.
 
         Raises:
             UserError: a flag cannot be used, or pyarrow is not installed.
@@ -183,22 +186,22 @@ class _Export:
         )
 
     def claim(self) -> None:
-        """Marks `frames/`.
+        """Marks the folder `frames/` as belonging to this export.
 
         Raises:
-            UserError: it holds frames that were recorded in another way.
+            UserError: the folder holds frames that were recorded in another way.
         """
         described = dataclasses.asdict(self.recording)
         claim_folder(require_folder(self.frames), "recording.json", described, of="recording")
 
     def file(self, seed: int) -> Path:
-        """The frames of an episode."""
+        """The file with the frames of an episode."""
         return self.frames / f"seed_{seed:08d}.npz"
 
     def write(
         self, demonstrations: Path, *, workers: Workers, sent: ChosenScenario, console: Console
     ) -> None:
-        """Writes the dataset; runs again what was demonstrated without frames.
+        """Writes the dataset; repeats the demonstrations whose frames are missing.
 
         Raises:
             UserError: the dataset cannot be written, or an episode cannot be repeated.
@@ -252,7 +255,7 @@ def _origin(chosen: ChosenScenario, first_seed: int) -> Origin:
 
 
 def _task_in_words(chosen: ChosenScenario) -> str:
-    """The task's name in words: `stack block pyramid` for `!StackBlockPyramid`."""
+    """Returns the task's name in words: `stack block pyramid` for `!StackBlockPyramid`."""
     name = type(chosen.scenario.task).__name__
     return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name).lower()
 
@@ -274,7 +277,7 @@ def _run(
 def _demonstrate(
     chosen: ChosenScenario, seed: int, log: Path | None, recording: FrameSettings | None
 ) -> tuple[Demonstration | Rejection, EpisodeFrames | None]:
-    # Without rendering, the station would have no cameras.
+    # Enable rendering, because the station would otherwise have no cameras.
     require_rendering()
     try:
         diagram, station = build_chosen(chosen, seed=seed)

@@ -1,4 +1,4 @@
-"""`python -m kitting_drake.decide FRAME... --camera CALIBRATION.yaml`: decides one action.
+"""`python -m kitting_drake.decide FRAME... --camera CALIBRATION.yaml`: decides on one action.
 
 Computes a pick and place in the robot's frame from frames of real cameras, without Drake. See
 docs/bench.md.
@@ -66,7 +66,7 @@ def main() -> int:
         _find(arguments, folder, console)
         return 0
     action, picture = folder / "action.json", folder / "decision.png"
-    # Remove stale files: after a failure, nobody must use the action of an earlier frame.
+    # Remove stale files, so that nobody uses the action of an earlier frame after a failure.
     names = CHECK_FILES if arguments.check else (action.name, picture.name, *TRAJECTORY_FILES)
     if not arguments.check:
         _check_decided(action)
@@ -106,7 +106,7 @@ def main() -> int:
 
 
 def _check_robot_flags(arguments: argparse.Namespace) -> None:
-    """Raises UserError if `--robot` or `--rate` does not go with the other flags."""
+    """Raises UserError if `--robot` or `--rate` contradicts other flags."""
     if arguments.robot is None:
         if arguments.rate is not None:
             raise UserError("--rate needs --robot")
@@ -166,7 +166,8 @@ def _find(arguments: argparse.Namespace, folder: Path, console: Console) -> None
 
 
 def _check_decided(action: Path) -> None:
-    """Raises UserError if `action.json` is not from this command, but e.g. a demonstration's."""
+    """Raises UserError if `action.json` was not written by this command, but for a
+    demonstration."""
     try:
         record = json.loads(action.read_text())
     except FileNotFoundError:
@@ -206,7 +207,11 @@ def _parser() -> argparse.ArgumentParser:
         help="intrinsics and poses of the cameras",
     )
     parser.add_argument(
-        "--output", type=Path, default=Path("output/decide"), metavar="DIR", help="folder for files"
+        "--output",
+        type=Path,
+        default=Path("output/decide"),
+        metavar="DIR",
+        help="folder for the files",
     )
     _add_policy_flags(parser)
     _add_camera_flags(parser)
@@ -214,16 +219,17 @@ def _parser() -> argparse.ArgumentParser:
         "--time",
         type=float,
         metavar="S",
-        help="in a recording, take the frame this long after its start, in s",
+        help="for a recording: the time of the frame after the start, in s",
     )
     parser.add_argument(
         "--robot",
         type=Path,
         metavar="ROBOT.yaml",
-        help="also plan the joint trajectory of a Franka arm, and refuse what it cannot reach",
+        help="also plan the joint trajectory of a Franka arm, and refuse actions that it cannot "
+        "reach",
     )
     parser.add_argument(
-        "--rate", type=int, metavar="HZ", help="points of the trajectory in a second (1000)"
+        "--rate", type=int, metavar="HZ", help="points of the trajectory per second (1000)"
     )
     parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
     return parser
@@ -238,7 +244,7 @@ def _add_policy_flags(parser: argparse.ArgumentParser) -> None:
         help="weights of the networks (default: the generalist)",
     )
     policy.add_argument(
-        "--shape_matching", action="store_true", help="fit outlines instead of using networks"
+        "--shape_matching", action="store_true", help="match outlines instead of using networks"
     )
     parser.add_argument(
         "--orientations",
@@ -249,13 +255,14 @@ def _add_policy_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--no_outlines",
         action="store_true",
-        help="networks: do not refine actions by outlines (for tasks without cavities)",
+        help="with networks: do not refine actions by outlines (for tasks without cavities)",
     )
     parser.add_argument(
         "--least_confidence",
         type=_share,
         metavar="P",
-        help="act only with at least this probability of success (default: as fitted)",
+        help="act only if the probability of success is at least this (default: the fitted "
+        "threshold)",
     )
     parser.add_argument("--recover", action="store_true", help="recover from failed insertions")
 
@@ -268,19 +275,20 @@ def _add_camera_flags(parser: argparse.ArgumentParser) -> None:
         help="height of the table in the base frame, in m (default: the calibration's, or 0)",
     )
     parser.add_argument(
-        "--check", action="store_true", help="check the calibration by frames of the empty table"
+        "--check", action="store_true", help="check the calibration with frames of the empty table"
     )
     parser.add_argument(
         "--find",
         action="store_true",
-        help="propose the table's height, the workspace and the region by one frame",
+        help="propose the table's height, the workspace and the region from one frame of each "
+        "camera",
     )
     parser.add_argument(
         "--kit_size_mm",
         type=float,
         nargs=3,
         metavar=("L", "W", "H"),
-        help="with --check: size of a block that lies on the table",
+        help="with --check: the size of a block that lies on the table, in mm",
     )
     parser.add_argument(
         "--kit_pose",
@@ -293,7 +301,8 @@ def _add_camera_flags(parser: argparse.ArgumentParser) -> None:
         "--calibrate",
         type=Path,
         metavar="BOARD.yaml",
-        help="find the cameras' poses by a board of markers on the table; --camera may lack poses",
+        help="find the cameras' poses from a board of markers on the table; --camera may lack "
+        "poses",
     )
 
 
@@ -318,7 +327,7 @@ def _policy(arguments: argparse.Namespace) -> BenchPolicy:
 
 
 def _share(text: str) -> float:
-    """A number from 0 to 1, for argparse."""
+    """Parses a number from 0 to 1, for argparse."""
     value = float(text)
     if not 0 <= value <= 1:
         raise argparse.ArgumentTypeError("give a probability from 0 to 1")

@@ -1,7 +1,7 @@
 """`python -m kitting_drake.demonstrate FOLDER --camera CALIBRATION.yaml`: real demonstrations.
 
-Converts a folder of frames and actions to a file for `train`, without Drake. `--click` serves a
-page on which a person enters the actions. See docs/bench.md.
+Converts a folder of frames and actions to a file for `train`, without Drake. With `--click`, it
+serves a page on which a person enters the actions. See docs/bench.md.
 """
 
 import argparse
@@ -55,7 +55,10 @@ def _annotate(folder: Path, calibration: Calibration, port: int) -> None:
     steps = [step for steps in find_demonstrations(folder) for step in steps]
     with AnnotationServer(steps, calibration, port) as server:
         # Print the address even with --quiet.
-        print(f"annotate at {server.url}; Ctrl-C ends and keeps what was saved", flush=True)
+        print(
+            f"annotate at {server.url}; Ctrl-C ends the server, and keeps the saved actions",
+            flush=True,
+        )
         server.serve_forever()
 
 
@@ -68,8 +71,8 @@ def _parser() -> argparse.ArgumentParser:
         "folder",
         type=Path,
         metavar="FOLDER",
-        help="holds a folder for each demonstration, with a folder for each step, with frames and "
-        "action.json",
+        help="a folder with a folder for each demonstration, which has a folder with frames and "
+        "action.json for each step",
     )
     parser.add_argument(
         "--camera",
@@ -97,7 +100,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--no_later_picks",
         action="store_true",
-        help="the order of the picks matters, e.g. when stacking",
+        help="the order of the picks matters, for instance when stacking",
     )
     parser.add_argument(
         "--no_curvature",

@@ -43,13 +43,13 @@ _DRAWN_BY = (
 )
 """The packages and modules that determine the drawn scenes."""
 _CATALOGUE = MODELS / "tools" / "catalogue.yaml"
-"""The designs of tools that are varied."""
+"""The designs of tools that are varied at random."""
 _DRAWN = ".drawn"
-"""Suffix of the file that counts the scenes of an unfinished batch."""
+"""The suffix of the file that counts the scenes of an unfinished batch."""
 _POLL = 0.5
-"""Period of reading these files, in s."""
+"""The time between two readings of these files, in s."""
 _MOST_BATCHES = 10_000
-"""Upper bound of the number of batches of a seed."""
+"""The largest number of batches of a seed."""
 
 
 def main() -> int:
@@ -69,7 +69,7 @@ def main() -> int:
         scenes = parts.assemble(arguments.scenes, path)
     finals = sum(not len(scene.actions) for scene in scenes)
     console.print(
-        f"{path} holds {len(scenes)} scenes, in {finals} of them nothing is left to do",
+        f"{path} holds {len(scenes)} scenes; in {finals} of them nothing is left to do",
         highlight=False,
         markup=False,
     )
@@ -77,14 +77,14 @@ def main() -> int:
 
 
 def _drawn_by(random_views: bool = False) -> dict[str, str]:
-    """The versions, sources, designs and cameras that decide how the scene of a seed looks."""
+    """Returns the versions, sources, designs and cameras that determine the scenes of a seed."""
     views = {"cameras": "random"} if random_views else {}
     catalogue = hashlib.sha256(_CATALOGUE.read_bytes()).hexdigest()[:16]
     return {**versions(), "code": source_digest(*_DRAWN_BY), "catalogue": catalogue, **views}
 
 
 class _Parts:
-    """Files with a batch of scenes each. They are kept, so that later runs can add batches."""
+    """The files of the batches of scenes. They are kept, so that later runs can add batches."""
 
     def __init__(self, folder: Path, seed: int, drawn_by: dict[str, str]) -> None:
         """Reads the files of earlier runs.
@@ -92,7 +92,7 @@ class _Parts:
         Args:
             folder: the folder of the files.
             seed: the seed of all draws.
-            drawn_by: versions and digests of the code.
+            drawn_by: the versions, sources, designs and cameras that determine the scenes.
 
         Raises:
             UserError: a file has another seed or version, or is damaged.
@@ -100,7 +100,7 @@ class _Parts:
         self._folder, self._seed, self._drawn_by = require_folder(folder), seed, drawn_by
         self._counts = {}
         for path in folder.glob(f"*{_DRAWN}"):
-            # Left by a killed process.
+            # Remove the counts that a killed process left behind.
             path.unlink()
         for path in folder.glob("batch_*.h5"):
             number = path.stem.removeprefix("batch_")
@@ -126,14 +126,15 @@ class _Parts:
         return self._folder / f"batch_{batch:06d}.h5"
 
     def draw(self, count: int, workers: LocalWorkers, console: Console) -> None:
-        """Draws batches until the batches before the first missing one have `count` scenes."""
+        """Draws batches until those before the first missing batch have `count` scenes."""
         begun = set(self._counts)
 
         def next_batch() -> int | None:
             if self._gapless() >= count:
                 return None
             batch = next(i for i in range(_MOST_BATCHES) if i not in begun)
-            # Begin no further batch if the scenes suffice once the missing batches are complete.
+            # Begin no further batch if the scenes will suffice once the missing batches are
+            # complete.
             if sum(self._counts.values()) >= count and batch > max(self._counts):
                 return None
             begun.add(batch)
@@ -150,7 +151,7 @@ class _Parts:
                 self._count(outcomes)
 
     def _count(self, outcomes: Iterable[tuple[int, int | ProcessCrashed]]) -> None:
-        """Counts the scenes of each batch as it ends."""
+        """Counts the scenes of each batch when it ends."""
         for batch, outcome in outcomes:
             if isinstance(outcome, ProcessCrashed):
                 raise UserError(
@@ -163,20 +164,20 @@ class _Parts:
         """The number of scenes, including those of unfinished batches."""
         unfinished = 0
         for path in self._folder.glob(f"*{_DRAWN}"):
-            # The process that writes the file may just have removed or truncated it.
+            # Ignore errors: the process that writes the file may have just removed or truncated it.
             with contextlib.suppress(OSError, ValueError):
                 unfinished += int(path.read_text())
         return sum(self._counts.values()) + unfinished
 
     def _gapless(self) -> int:
-        """The number of scenes in the batches before the first missing one."""
+        """Returns the number of scenes in the batches before the first missing one."""
         batches = itertools.takewhile(self._counts.__contains__, itertools.count())
         return sum(self._counts[batch] for batch in batches)
 
     def assemble(self, count: int, path: Path) -> tuple[StaticScene, ...]:
         """Writes the first `count` scenes to one file; returns them."""
         batches = [self._read(batch).scenes for batch in sorted(self._counts)]
-        # A batch is empty if no toolset fits.
+        # A batch is empty if no toolset fits into a kit.
         ends = sorted({*itertools.accumulate(len(scenes) for scenes in batches)} - {0})
         everything = tuple(itertools.chain.from_iterable(batches))
         content = StaticScenes(PixelGrid(), everything, self._seed, self._drawn_by, tuple(ends))
@@ -219,8 +220,8 @@ def _every(seconds: float, call: Callable[[], object]) -> Iterator[None]:
 def _parse() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="python -m kitting_drake.draw_scenes",
-        description="Draw static scenes of random tools and kits, to train a generalist. "
-        "Run the same command again to resume.",
+        description="Draw static scenes of random tools and kits, to train a generalist. Run the "
+        "same command again to resume.",
     )
     parser.add_argument("--scenes", type=count_type, default=3000, help="number of scenes (3000)")
     parser.add_argument("--seed", type=seed_type, default=0, help="seed of all draws (0)")

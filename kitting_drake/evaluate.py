@@ -43,7 +43,7 @@ from kitting_drake.scenario.workers import add_workers_flags, open_workers
 from kitting_drake.station.hidden_table import hidden_table_note
 
 Run = Callable[[int], Episode]
-"""Runs the episode of a seed. Called in threads."""
+"""A function that runs the episode of a seed. It is called in threads."""
 
 
 def main() -> int:
@@ -72,7 +72,7 @@ def main() -> int:
     known = chosen.scenario.policy.training_seeds(chosen.base).intersection(seeds)
     if known:
         console.print(f"note: the policy has learned from seeds {min(known)} to {max(known)}")
-    # Fail early if no seed can be built.
+    # Report an error now if the scene of no seed can be built.
     success = build_any_chosen(chosen, seeds).scene.success
     if note := uncommitted_note():
         console.print(f"note: {note}", highlight=False, markup=False)
@@ -110,9 +110,9 @@ class Evaluation:
     """The result of `evaluate`."""
 
     episodes: list[Episode]
-    """In the order of the seeds."""
+    """The episodes in the order of the seeds."""
     wall_seconds_total: float
-    """The wall-clock time of all commands that ran episodes in the folder, in s."""
+    """The total wall-clock time of all commands that ran episodes in the folder, in s."""
 
 
 def evaluate(
@@ -126,16 +126,16 @@ def evaluate(
 ) -> Evaluation:
     """Runs an episode for each seed.
 
-    Skips the episodes in `folder/episodes.jsonl`. Appends each episode as it ends, with the commit
-    of the code that ran it.
+    Episodes that are in `folder/episodes.jsonl` already are skipped. Each new episode is appended
+    when it ends, with the commit of the code that ran it.
 
     Args:
         chosen: the scenario.
-        seeds: one episode each.
+        seeds: the seeds, one for each episode.
         folder: the folder of `episodes.jsonl`.
-        run: runs an episode; called in threads.
-        workers: determine the number of parallel episodes.
-        console: where to show the progress bar.
+        run: a function that runs an episode; it is called in threads.
+        workers: the processes that run episodes, whose number limits the parallel episodes.
+        console: the console for the progress bar.
 
     Raises:
         UserError: the folder holds episodes of another scenario, policy, version or other input
@@ -155,7 +155,7 @@ def evaluate(
     with counting_bar(console, "episodes") as progress:
         task = progress.add_task("", total=len(seeds), completed=len(seeds) - len(pending))
         for episode in side_by_side(run, lambda: next(queue, None), workers=workers):
-            # Workers with a checkout report their own commit.
+            # Keep the commit of an episode from a worker that has its own checkout.
             episode["commit"] = episode.get("commit") or now
             done[episode["seed"]] = episode
             append_line(path, episode)
@@ -165,7 +165,8 @@ def evaluate(
 
 
 class _WallClock:
-    """Measures the total time of all commands that ran in a folder, and saves it in a file.
+    """Measures the total wall-clock time of all commands that ran in a folder, and saves it in a
+    file.
 
     If a command is killed, the time since its last finished episode is not counted.
     """
@@ -192,14 +193,14 @@ def run_in_worker(
 ) -> Episode:
     """Runs one episode in another process and waits for it.
 
-    If the process dies, returns a failed episode with the reason. If it was killed from outside,
-    first tries once more.
+    If the process dies, a failed episode with the reason is returned. If the process was killed
+    from outside, it is first started once more.
 
     Args:
-        workers: run the process.
+        workers: the workers that start the process.
         chosen: the scenario, with paths that are valid for the workers.
         seed: the seed of the episode.
-        log: the log file without the seed; see `log_of_seed`.
+        log: the log file, whose name gets the seed (see `log_of_seed`); None for no log.
 
     Raises:
         UserError: the process was killed twice.
@@ -218,7 +219,7 @@ def run_in_worker(
 
 
 def _work(chosen: ChosenScenario, seed: int, log: Path | None) -> Episode | str:
-    """The episode, or the reason why its scene cannot be built."""
+    """Returns the episode, or the reason why its scene cannot be built."""
     try:
         diagram, station = build_chosen(chosen, seed=seed)
     except MachineError:
@@ -232,12 +233,12 @@ def _work(chosen: ChosenScenario, seed: int, log: Path | None) -> Episode | str:
 
 @functools.cache
 def _commit_of_process() -> str | None:
-    """The commit at this process's first episode, i.e. that of the loaded code."""
+    """Returns the commit at this process's first episode, which is that of the loaded code."""
     return commit()
 
 
 def _lost_episode(chosen: ChosenScenario, seed: int, failure: str, seconds: float) -> Episode:
-    """A failed episode of which only the reason is known."""
+    """Makes a failed episode of which only the reason is known."""
     return EpisodeResult(
         scenario=chosen.name,
         policy=chosen.policy,

@@ -1,10 +1,12 @@
 """`python -m kitting_drake.results`: writes the pages of results from the runs in docs/results/.
 
-The pages are docs/results.md with its figures, docs/protocol.md, and the table in
+The pages are docs/results.md with its figures, docs/protocol.md, and the tables in
 docs/robustness.md. `--add` adds a run of `evaluate` to the runs, and `--remove` removes one. A run
-with the name of a cell of `benchmark paper` fills that cell; it needs a tree without uncommitted
-changes. The folder also holds `learning_rates.json` of `benchmark paper` and a copy of
-`networks.json` of `benchmark networks`. All numbers come from this folder, except the paper's own.
+with the name of a cell of `benchmark paper` fills this cell; its commit must have no uncommitted
+changes.
+
+The folder also has `learning_rates.json` from `benchmark paper`, and a copy of `networks.json` from
+`benchmark networks`. All numbers come from this folder, except those of the paper.
 """
 
 import argparse
@@ -90,7 +92,7 @@ def _parser() -> argparse.ArgumentParser:
         type=Path,
         metavar="FILE.md",
         default=Path("docs/results.md"),
-        help="page to write; protocol.md is written beside it (docs/results.md)",
+        help="the page to write; protocol.md is written to the same folder (docs/results.md)",
     )
     parser.add_argument(
         "--add",
@@ -98,7 +100,7 @@ def _parser() -> argparse.ArgumentParser:
         action="append",
         default=[],
         metavar=("NAME", "DIR"),
-        help="first add a run: its name, and the output folder of evaluate",
+        help="first add a run: its name, and the output folder of `evaluate`",
     )
     parser.add_argument(
         "--remove", action="append", metavar="NAME", help="first remove the run of this name"
@@ -108,7 +110,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _draw(answers: Sequence[Result], efficiency: dict[str, Any] | None, folder: Path) -> None:
-    """Draws figure 6, the networks' run times and table I, where results exist."""
+    """Draws figure 6, the networks' run times and table I, if there are results for them."""
     by_name = {answer.cell.name: answer for answer in answers}
     for task in ("seen", "unseen"):
         if has_figure(task, answers):

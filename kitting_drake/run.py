@@ -1,4 +1,5 @@
-"""`python -m kitting_drake.run SCENARIO.yaml`: runs an episode in Meshcat, saves a replay."""
+"""`python -m kitting_drake.run SCENARIO.yaml`: runs an episode, shows it in Meshcat, saves a
+replay."""
 
 import argparse
 from pathlib import Path
@@ -116,7 +117,7 @@ def _parser() -> argparse.ArgumentParser:
         "--picture",
         type=Path,
         metavar="FILE.png",
-        help="also render the station at the end of the episode",
+        help="also render the station at the end of the episode (.png)",
     )
     add_log_flag(parser)
     parser.add_argument(
@@ -126,7 +127,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _save_replay(path: Path, meshcat: Meshcat | None) -> None:
-    """Saves the recording, if there is one; removes a stale one."""
+    """Saves the recording, if there is one; removes an earlier one otherwise."""
     path.unlink(missing_ok=True)
     if meshcat is not None:
         meshcat.StopRecording()
@@ -135,7 +136,8 @@ def _save_replay(path: Path, meshcat: Meshcat | None) -> None:
 
 
 def _save_decisions(folder: Path, decisions: "list[tuple[Observation, Decision]]") -> None:
-    """Saves a picture of each decision of a learned policy; removes stale ones."""
+    """Saves a picture of each decision of a learned policy; removes the pictures of earlier
+    runs."""
     for path in folder.glob("decision_*.png"):
         path.unlink()
     if decisions:
@@ -148,12 +150,12 @@ def _save_decisions(folder: Path, decisions: "list[tuple[Observation, Decision]]
 
 
 def _check_files(picture: Path | None, video: Path | None, replay: Path) -> None:
-    """Raises UserError for a file that cannot be written after the episode."""
+    """Raises UserError if a file cannot be written after the episode."""
     if picture is not None and picture.suffix != ".png":
         raise UserError(f"--picture writes .png files, not '{picture}'")
     if video is not None and video.suffix not in (".gif", ".webp"):
         raise UserError(f"--video writes .gif and .webp files, not '{video}'")
-    # Fail early.
+    # Check this before the episode.
     for path in (picture, video, replay):
         if path is not None and path.is_dir():
             raise UserError(f"{path} is a folder")

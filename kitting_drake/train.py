@@ -35,7 +35,7 @@ def main() -> int:
     settings = _settings(arguments, learned, held_out)
     _check_validation(settings, held_out, arguments.validation or arguments.demos)
     if arguments.export:
-        # Fail early.
+        # Report unusable data before the training starts.
         from kitting_drake.policies.training.onnx_export import require_onnx
 
         require_onnx()
@@ -44,7 +44,8 @@ def main() -> int:
     )
     run = TrainingRun(settings, learned, held_out, folder, console, arguments.start)
     with alone_in(folder):
-        # The same seeds give other data in a changed scenario of the same name.
+        # Compare the contents, because the same seeds give other data in a changed scenario of the
+        # same name.
         origins = [item.origin for item in (learned, held_out)]
         made_by = [item.made_by for item in (learned, held_out)]
         described = {**dataclasses.asdict(settings), "origins": origins, "made_by": made_by}
@@ -57,7 +58,7 @@ def main() -> int:
 
 
 def _export(arguments: argparse.Namespace, weights: Path, console: Console) -> None:
-    """Writes weights as ONNX to the folder `onnx` in --output, by default beside the weights."""
+    """Writes weights as ONNX to the folder `onnx` in --output, or by default beside the weights."""
     # Import ONNX lazily.
     from kitting_drake.policies.training.onnx_export import export_onnx
 
@@ -73,8 +74,8 @@ def _settings(
     assumed = learned.learning
     if arguments.taken_only and not learned.has_taken:
         raise UserError(
-            f"--taken-only needs demonstrations: {arguments.demos} holds static scenes, in which "
-            "no object was picked"
+            f"--taken-only needs demonstrations, but {arguments.demos} has static scenes, in "
+            "which no object was picked"
         )
     begun: NetworkConfig | None = None
     seeds: tuple[int, ...] = ()
@@ -94,7 +95,7 @@ def _settings(
         learning_rate=arguments.learning_rate,
         decay=arguments.decay,
         taken_only=arguments.taken_only or not assumed.later_picks_possible,
-        # The Transporter rotates whole images and has no crop to bend.
+        # The Transporter rotates whole images, so it has no crop to bend.
         rigid=arguments.rigid or not assumed.curvature or arguments.method == "transporter",
         reflection=assumed.reflection and not arguments.rigid,
         colour=learned.colour if begun is None else begun.colour,
@@ -116,10 +117,10 @@ def _checked_start(
     """Checks the weights of --from against the flags and the data.
 
     Returns:
-        Their config, `card_seeds` and `learned_seeds`.
+        The weights' network configuration, and their `card_seeds` and `learned_seeds`.
 
     Raises:
-        UserError: they do not match, or they learned from a seed of the validation data.
+        UserError: the weights do not match, or were trained on a seed of the validation data.
     """
     file = read_weights_file(arguments.start)
     config = file.config
@@ -127,12 +128,12 @@ def _checked_start(
     shared = set(before.get(held_out.scenario, ())) & set(held_out.seeds)
     if shared:
         raise UserError(
-            f"{arguments.start} learned from seed {min(shared)}, which is in the validation data: "
-            "give other validation data with --validation"
+            f"{arguments.start} was trained on seed {min(shared)}, which is in the validation "
+            "data: give other validation data with --validation"
         )
     fixed = ["method", "preset", "orientations"]
     if arguments.angle_only:
-        # The new angle network may have another N and size.
+        # The new pick-angle network may have another N and size.
         fixed = ["method"] if config.has_unets_of(arguments.preset) else ["method", "preset"]
     for flag in fixed:
         given, found = getattr(arguments, flag), getattr(config, flag)
@@ -143,24 +144,26 @@ def _checked_start(
     resolution, found = learned.grid.resolution, file.card.get("resolution")
     if found is not None and not math.isclose(found, resolution, rel_tol=1e-6):
         raise UserError(
-            f"{arguments.start} learned from pixels of {found:g} m, but {arguments.demos} has "
+            f"{arguments.start} was trained with pixels of {found:g} m, but {arguments.demos} has "
             f"pixels of {resolution:g} m"
         )
     return config, tuple(sorted(card_seeds(file.card))), before
 
 
 def _check_validation(settings: Settings, held_out: TrainingData, path: Path) -> None:
-    """Raises UserError if the data cannot select a checkpoint or the threshold for stopping."""
+    """Raises UserError if the validation data cannot select a checkpoint or the stopping
+    threshold."""
     if settings.colour and not held_out.colour:
         raise UserError(
-            f"{path} has no colours, but the networks need them: give other data with --validation"
+            f"{path} has no colours, but the networks need them: give other validation data with "
+            "--validation"
         )
     _require_picks(held_out, path, "for validation")
     if settings.stop and not held_out.finals(1):
         raise UserError(
-            f"{path}: none of the {held_out.count} {held_out.kind} for validation ends with "
-            "nothing left to pick, so the policy cannot learn when to stop: "
-            f"{held_out.made} more, or give other data with --validation"
+            f"all {held_out.count} {held_out.kind} for validation in {path} end with objects left to "
+            "pick, so the policy cannot learn when to stop: "
+            f"{held_out.verb} more, or give other validation data with --validation"
         )
 
 
@@ -169,7 +172,7 @@ def _require_picks(data: TrainingData, path: Path, purpose: str) -> None:
     if not data.scenes(1):
         raise UserError(
             f"none of the {data.count} {data.kind} in {path} {purpose} has an object to pick: "
-            f"{data.made} more"
+            f"{data.verb} more"
         )
 
 
@@ -187,13 +190,15 @@ def _parse() -> argparse.Namespace:
     if arguments.demos and arguments.export and arguments.method == "transporter":
         parser.error("--export onnx: a transporter cannot be exported")
     if arguments.angle_only and not arguments.start:
-        parser.error("--angle-only needs --from for the weights of the other networks")
+        parser.error("--angle-only needs --from, which gives the weights of the other networks")
     if arguments.angle_only and arguments.method == "transporter":
         parser.error("--angle-only: a transporter has no separate angle network")
     if arguments.rotations and arguments.method != "transporter":
-        parser.error("--rotations is for --method transporter: the other methods rotate no images")
+        parser.error(
+            "--rotations is only for --method transporter: the other methods do not rotate images"
+        )
     if arguments.weights and (arguments.demos or not arguments.export):
-        parser.error("--weights can only be given with --export and without --demos")
+        parser.error("--weights can only be given with --export, and without --demos")
     for flag, given in (
         ("--from", arguments.start),
         ("--validation", arguments.validation),
@@ -219,14 +224,14 @@ def _parser() -> argparse.ArgumentParser:
         "--demonstrations",
         type=count_type,
         metavar="N",
-        help="train on the first N (default: all but the validation data)",
+        help="train on the first N demonstrations or scenes (default: all but the validation data)",
     )
     parser.add_argument(
         "--validation",
         type=Path,
         metavar="FILE.h5",
-        help="validation data, which select the checkpoint (default: those after the training data "
-        "in --demos, a tenth as many; with other tools, if they are static scenes)",
+        help="validation data, which select the checkpoint (default: a tenth as many, after the "
+        "training data in --demos; static scenes are chosen with other tools)",
     )
     parser.add_argument(
         "--from",
@@ -236,15 +241,15 @@ def _parser() -> argparse.ArgumentParser:
         help="initial weights, such as models/policies/generalist.safetensors (default: random)",
     )
     _add_settings(parser)
-    parser.add_argument("--output", type=Path, metavar="DIR", help="folder for all files")
+    parser.add_argument("--output", type=Path, metavar="DIR", help="the folder for all files")
     parser.add_argument(
         "--export",
         choices=("onnx",),
-        help="also write the networks to the folder onnx in --output; without --demos, only export "
-        "the networks trained in --output or those of --weights",
+        help="also write the networks to the folder onnx in --output. Without --demos: only "
+        "export, either the networks trained in --output or those of --weights",
     )
     parser.add_argument(
-        "--weights", type=Path, metavar="FILE", help="weights to export, without --demos"
+        "--weights", type=Path, metavar="FILE", help="the weights to export, without --demos"
     )
     parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
     return parser
@@ -255,8 +260,8 @@ def _add_settings(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--angle-only",
         action="store_true",
-        help="train only the pick-angle network, from random weights; take the others from --from, "
-        "which may have another N, or another preset with the same U-nets",
+        help="train only the pick-angle network, from random weights. The others come from "
+        "--from, which may have another N, or another preset with the same U-nets",
     )
     parser.add_argument("--method", choices=METHODS, default="so2")
     parser.add_argument("--preset", choices=PRESETS, default="small", help="size of the networks")
@@ -265,30 +270,34 @@ def _add_settings(parser: argparse.ArgumentParser) -> None:
         "--rotations",
         type=count_type,
         metavar="N",
-        help="transporter: number of rotations of the crop that a step trains on, and half as many "
-        "of the scene (default: the label's and four more, the minimum)",
+        help="for the transporter: the number of rotations of the crop in a training step; half "
+        "as many of the scene are used (default: the label's and four more, the minimum)",
     )
     parser.add_argument("--steps", type=count_type, default=10_000, help="(10000)")
-    parser.add_argument("--learning-rate", type=_rate_type, default=1e-4, help="Adam's (1e-4)")
+    parser.add_argument(
+        "--learning-rate", type=_rate_type, default=1e-4, help="learning rate of Adam (1e-4)"
+    )
     parser.add_argument(
         "--decay", action="store_true", help="decay the learning rate to zero over the steps"
     )
     parser.add_argument(
         "--taken-only",
         action="store_true",
-        help="as in the paper: label each observation with the next pick only, not with later "
-        "picks too (always on if the task does not permit later picks)",
+        help="as in the paper: label each observation only with the next pick, and not with "
+        "later picks (always on if the task does not permit later picks)",
     )
     parser.add_argument(
         "--rigid",
         action="store_true",
-        help="as in the paper: augment by rigid motions only, without curvature (never used with "
-        "transporter) and reflection (both are off if the task does not permit them)",
+        help="as in the paper: augment only by rigid motions, without bending (never used with "
+        "transporter) and mirroring (both are off if the task does not permit them)",
     )
     parser.add_argument(
         "--validate-every", type=count_type, default=500, metavar="STEPS", help="(500)"
     )
-    parser.add_argument("--seed", type=seed_type, default=0, help="seed of weights and draws (0)")
+    parser.add_argument(
+        "--seed", type=seed_type, default=0, help="seed of the initial weights and of all draws (0)"
+    )
 
 
 def _rate_type(text: str) -> float:
@@ -304,16 +313,16 @@ def _rate_type(text: str) -> float:
 def _split(
     path: Path, count: int | None, validation: Path | None
 ) -> tuple[TrainingData, TrainingData]:
-    """The training and the validation data."""
+    """Returns the training and the validation data."""
     everything = read_training_data(path)
     total = everything.count
-    # Use all by default.
+    # Use all data by default.
     most_kept = total if count is None else max(1, count // 10)
     if count is None:
         count = total if validation else _most_unrelated(everything, total - max(1, total // 11))
     if total < count:
         raise UserError(
-            f"{path} holds {total} {everything.kind}, not {count}: {everything.made} more"
+            f"{path} holds {total} {everything.kind}, not {count}: {everything.verb} more"
         )
     learned = everything.part(0, count)
     if validation is None:
@@ -324,7 +333,7 @@ def _split(
                 f"{path} holds {total} {everything.kind}: {count} for training leave none for "
                 "validation"
                 f"{'' if everything.has_taken else ' with other tools'}: "
-                f"{everything.made} more, or give --validation"
+                f"{everything.verb} more, or give --validation"
             )
         return learned, kept
     held_out = read_training_data(validation)
@@ -339,7 +348,7 @@ def _split(
 
 
 def _most_unrelated(data: TrainingData, wanted: int) -> int:
-    """How many of the first items to train on, so that later ones are unrelated.
+    """Returns how many of the first items to train on, so that the later ones are unrelated.
 
     It is the largest such number that is at most `wanted`, or `wanted` if there is none.
     """

@@ -346,8 +346,8 @@ def test_a_run_that_cannot_be_repeated_fills_no_cell(folder: Path, monkeypatch: 
     evaluated = folder / "evaluated"
     evaluated.mkdir()
     for fields, said in (
-        ({"commit": "f00d+"}, r"of commit f00d\+, with uncommitted changes; commit the changes"),
-        ({"commit": None}, "its episodes are of an unknown commit"),
+        ({"commit": "f00d+"}, r"from commit f00d\+, with uncommitted changes; commit the changes"),
+        ({"commit": None}, "its episodes are from an unknown commit"),
         ({"policy_digest": None}, "lacks policy_digest, the digest of its weights"),
     ):
         (evaluated / "summary.json").write_text(json.dumps(good | fields))

@@ -159,7 +159,7 @@ def test_from_starts_with_given_weights(
     assert card_seeds(card) == {10, 11, 12, 13}
     assert list(card["start_learned"].values()) == [[10, 11, 12]]
     fewer = refused(demos, tmp_path / "no", "--from", start, "--demonstrations", 2)
-    assert "learned from seed 12, which is in the validation data" in fewer
+    assert "was trained on seed 12, which is in the validation data" in fewer
     assert "give --orientations 180" in refused(
         demos, tmp_path / "no", "--from", start, "--orientations", 36
     )
@@ -532,7 +532,7 @@ def test_validation_data_without_final_observations_are_refused(
     path = tmp_path / "validation.h5"
     write_demonstrations(path, ORIGIN, [demonstration(20, final=False)])
     told = refused(demos, tmp_path / "run", "--validation", path)
-    assert "nothing left to pick" in told
+    assert "objects left to pick" in told
 
 
 def static_scenes(path: Path, *counts: int, batch: int = 1) -> Path:

@@ -81,8 +81,8 @@ class TrainingData:
         return not isinstance(self.items, StaticScenes)
 
     @property
-    def made(self) -> str:
-        """The name of the command that makes such data, for messages."""
+    def verb(self) -> str:
+        """The verb for making such data, `draw` or `collect`, for messages."""
         return "draw" if isinstance(self.items, StaticScenes) else "collect"
 
     @property
@@ -224,5 +224,5 @@ def read_training_data(path: Path) -> TrainingData:
             },
         )
     if not data.count:
-        raise UserError(f"{path} holds no {data.kind}: {data.made} some")
+        raise UserError(f"{path} holds no {data.kind}: {data.verb} some")
     return data

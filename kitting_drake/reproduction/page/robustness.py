@@ -204,7 +204,7 @@ def with_figures(page: str, figures: str) -> str:
     _, end, tail = rest.partition(_END)
     if not begin or not end:
         raise UserError(
-            f"the page on robustness must have the marks {_BEGIN.strip()} and {_END.strip()}"
+            f"the page on robustness lacks the marks {_BEGIN.strip()} and {_END.strip()}"
         )
     return f"{head}{begin}{figures}{end}{tail}"
 

@@ -20,8 +20,9 @@ ORIGINAL = {"alpha": 4_537_185, "beta": 835_888, "phi": 4_537_185, "psi": 4_537_
 _TEXT = f"""\
 #### Parameters of every network
 
-Trainable parameters at N = {ORIENTATIONS}, counted from the networks. The Transporter's one picking
-network, f_pick, stands under alpha. The last column is the share of the original's parameters.
+The table has the trainable parameters at N = {ORIENTATIONS}. The only picking network of the
+Transporter, f_pick, is under alpha. The last column compares with the original. For both baselines,
+the original is our preset `paper`.
 
 The presets `small` and `matched` differ in the baselines only. In `matched`, the Transporter keeps
 the same share of its original's parameters as our method does. The pick-angle network (beta) of the
@@ -34,8 +35,6 @@ The parameters of the originals come from these sources:
   The authors' pick-angle network has 0.90 M at N = {ORIENTATIONS}.
 - The Transporter: the paper does not count its parameters. Our preset `paper` has the published
   widths of its ResNets of 43 layers.
-
-For both baselines the last column compares with the preset `paper`.
 """
 
 

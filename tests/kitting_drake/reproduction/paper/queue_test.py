@@ -170,7 +170,7 @@ def test_a_cell_with_an_unrepeatable_run_is_run_again(
     assert queue.pending([ORACLE]) == [ORACLE]
     queue.commit = "f00d, c0ffee+"
     (failure,) = queue.run([ORACLE]).values()
-    assert "its episodes are of commit f00d, c0ffee+, with uncommitted changes" in failure
+    assert "its episodes are from commit f00d, c0ffee+, with uncommitted changes" in failure
     assert read_summaries(queue.results)[ORACLE.name]["commit"] == "c0ffee+"
     queue.commit = "f00d"
     assert queue.run([ORACLE]) == {}
