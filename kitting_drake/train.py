@@ -161,8 +161,8 @@ def _check_validation(settings: Settings, held_out: TrainingData, path: Path) ->
     _require_picks(held_out, path, "for validation")
     if settings.stop and not held_out.finals(1):
         raise UserError(
-            f"all {held_out.count} {held_out.kind} for validation in {path} end with objects left to "
-            "pick, so the policy cannot learn when to stop: "
+            f"all {held_out.count} {held_out.kind} for validation in {path} end with objects left "
+            "to pick, so the policy cannot learn when to stop: "
             f"{held_out.verb} more, or give other validation data with --validation"
         )
 

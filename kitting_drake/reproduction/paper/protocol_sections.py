@@ -96,7 +96,7 @@ def _rates_text(rates: Rates) -> str:
             f"{rate} ({f'{cost:.2f} {unit}' if math.isfinite(cost) else 'diverged'})"
             for rate, cost in costs.items()
         )
-        parts.append(f"- {who}: {best_rate(costs)} of {tried}\n")
+        parts.append(f"- {who}: {best_rate(costs)}, chosen from {tried}\n")
     return prose("learning_rates", ours=f"{LEARNING_RATES[0]:g}") + "\n" + "".join(parts)
 
 
