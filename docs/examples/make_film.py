@@ -1,6 +1,6 @@
 """Makes docs/film.webp: a kit filled by the learned policy, with the maps behind each decision.
 
-Run it from the root of the tree: `.venv/bin/python docs/examples/make_film.py [FILE.webp]`.
+Run it from the root of the repository: `.venv/bin/python docs/examples/make_film.py [FILE.webp]`.
 """
 
 import io
@@ -39,7 +39,7 @@ class Film:
         self._frames = []
 
     def decided(self, observation, decision):
-        """Puts the maps of a decision under all further frames; `with_policy` calls it."""
+        """Shows the maps of a decision under all further frames; `with_policy` calls it."""
         png = draw_maps(observation, decision, width=WIDTH)
         self._maps = Image.open(io.BytesIO(png)).convert("RGB")
 

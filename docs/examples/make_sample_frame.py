@@ -1,6 +1,7 @@
-"""Makes models/sample_frame/: what two real cameras would see of a kit and four tools.
+"""Makes models/sample_frame/: the images that two real cameras would take of a kit and four tools.
 
-Run it from the root of the tree: `.venv/bin/python docs/examples/make_sample_frame.py [FOLDER]`.
+Run it from the root of the repository: `.venv/bin/python docs/examples/make_sample_frame.py
+[FOLDER]`.
 """
 
 import dataclasses
@@ -30,11 +31,11 @@ cameras:
 """
 DEPTH_SCALE = 0.0001  # Metres per step of the depth images.
 POINTS = 200  # Points of a tool's surface in truth.json.
-FARTHEST = 6.5  # Depths beyond this do not fit 16 bits, and are left out, in metres.
+FARTHEST = 6.5  # The largest depth that fits into 16 bits, in metres; larger depths are left out.
 
 
 def calibration_of(scenario, depth_scale=0.001):
-    """The true calibration of a scenario's cameras."""
+    """Returns the true calibration of a scenario's cameras."""
     cameras = tuple(
         BenchCamera(
             name,
@@ -52,11 +53,14 @@ def calibration_of(scenario, depth_scale=0.001):
 
 
 def take_frames(station, context):
-    """The frames of a station's cameras, and the poses that it believes they have, by name.
+    """Takes the frames of a station's cameras.
 
     Args:
         station: a `KittingStation` with cameras.
-        context: the station's own.
+        context: the station's own context.
+
+    Returns:
+        The frames, and the poses in the station's calibration, by camera name.
     """
     frames, poses = {}, {}
     for name in station.scenario.cameras:
@@ -70,10 +74,11 @@ def take_frames(station, context):
 
 
 def truth(scene):
-    """The true poses (x, y, yaw) of the tools and of their places, in metres and radians, as JSON.
+    """Returns the true poses (x, y, yaw) of the tools and of their places as JSON, in metres and
+    radians.
 
-    A tool's points are a sample of its surface, in its own frame: x, y, in metres. A rotation by
-    2 pi / symmetry changes nothing.
+    A tool's points (x, y), in metres, are a sample of its surface in its own frame. A rotation by 2
+    pi / symmetry maps the tool to itself.
     """
     tools = {}
     for goal in scene.goals:
@@ -103,20 +108,20 @@ def write_sample(folder, frames, calibration, true):
         steps = np.rint(np.where(near, frame.depth, 0) / DEPTH_SCALE).astype(np.uint16)
         Image.fromarray(steps).save(folder / f"{name}_depth.png", optimize=True)
     write_calibration(folder / "calibration.yaml", calibration)
-    # A line for each tool.
+    # Put each tool on a line of its own.
     lines = ",\n".join(f"{json.dumps(name)}: {json.dumps(tool)}" for name, tool in true.items())
     (folder / "truth.json").write_text(f"{{\n{lines}\n}}\n")
 
 
 def main(folder=Path("models/sample_frame"), seed=SEED):
     scenario = load_scenario(SCENARIOS / "kitting_unseen.yaml", None, CAMERAS, NOISE)
-    # Without the default's third camera.
+    # Keep these two cameras only; the default has a third one.
     cameras = {name: scenario.cameras[name] for name in ("left", "right")}
     scenario = dataclasses.replace(scenario, cameras=cameras)
     station = build_station(scenario, seed, SCENARIOS)
     frames, poses = take_frames(station, station.CreateDefaultContext())
     calibration = with_poses(calibration_of(scenario, DEPTH_SCALE), poses)
-    # The errors of the poses are known: about 1 mm and 0.1 degrees.
+    # The calibration counts as verified, because its errors are known (1 mm, 0.1 degrees).
     calibration = dataclasses.replace(calibration, verified=True)
     write_sample(folder, frames, calibration, truth(station.scene))
     size = sum(path.stat().st_size for path in folder.iterdir())

@@ -1,16 +1,16 @@
-"""An extension of griffe: the comment above a field of a schema is its docstring.
+"""An extension of griffe that uses the comment above a field of a schema as its docstring.
 
-Drake's YAML schemas say in comments what a field means, as Drake's own examples do.
+Drake's YAML schemas explain their fields in comments, as Drake's own examples do.
 """
 
 import griffe
 
 
 class FieldComments(griffe.Extension):
-    """Makes docstrings of comments."""
+    """Makes docstrings of the comments above fields."""
 
     def on_attribute_instance(self, *, attr: griffe.Attribute, **kwargs: object) -> None:
-        """Reads the comment that stands directly above an attribute without a docstring."""
+        """Reads the comment directly above an attribute without a docstring."""
         owner = attr.parent
         if attr.docstring or attr.lineno is None or owner is None or not owner.is_class:
             return

@@ -1,4 +1,4 @@
-"""Hooks of MkDocs: the pages that are not in docs/, and links to files outside of it."""
+"""Hooks of MkDocs: they add pages that are not in docs/, and links to files outside docs/."""
 
 import json
 import logging
@@ -68,7 +68,7 @@ def on_config(config):
 
 
 def on_files(files: Files, config) -> Files:
-    """Adds the generated pages."""
+    """Adds the generated pages to the site."""
     _linked.clear()
     readme = (ROOT / "README.md").read_text()
     pages = {"index.md": readme, "tutorial.md": _notebook(DOCS / "tutorial.ipynb")}
@@ -85,7 +85,7 @@ def on_files(files: Files, config) -> Files:
 
 
 def on_page_markdown(markdown: str, page, config, files: Files) -> str:
-    """Turns links relative to the page's place in the tree into links of the site."""
+    """Converts links that are relative to the page's file into links of the site."""
     source = page.file.src_uri
     place = PurePosixPath("README.md" if source == "index.md" else f"docs/{source}")
 
@@ -105,7 +105,7 @@ def on_page_markdown(markdown: str, page, config, files: Files) -> str:
                 path = f"{path}/README.md"
             if (ROOT / path).exists():
                 picture = before.startswith("!")
-                # A browser shows text as it is.
+                # Link to text files as they are, because a browser can show them.
                 inside = f"{TREE}/{path}" if picture else f"{TREE}/{path}.txt"
                 _linked[inside] = ROOT / path
                 inside = "../" * source.count("/") + inside
@@ -135,7 +135,8 @@ def on_page_content(html: str, page, config, files: Files) -> str:
 
 
 def on_post_build(config) -> None:
-    """Copies the linked files outside docs/. A folder becomes a list of its files."""
+    """Copies the linked files outside docs/ to the site. For a folder, it writes a list of its
+    files."""
     for name, path in _linked.items():
         copy = Path(config.site_dir, name)
         copy.parent.mkdir(parents=True, exist_ok=True)
@@ -146,7 +147,7 @@ def on_post_build(config) -> None:
 
 
 def _reference(title: str, modules: list[str]) -> str:
-    """A page of the API."""
+    """Returns a page of the API reference."""
     return f"# {title}\n\n" + "\n".join(f"::: {module}\n" for module in modules)
 
 
@@ -168,7 +169,7 @@ def _outside_code(markdown: str, change) -> str:
 
 
 def _ports(text: str) -> str:
-    """The block of `pydrake_system` as Drake's own pages draw it."""
+    """Draws the block of `pydrake_system` as on Drake's own pages."""
     system = yaml.safe_load(text)
     cells = []
     for side in ("input_ports", "output_ports"):

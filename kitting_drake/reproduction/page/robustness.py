@@ -74,13 +74,13 @@ def robustness_table(runs: Sequence[Run]) -> str:
     parts = []
     if common:
         parts.append(
-            f"{len(_SEEDS)} episodes from seed {_SEEDS[0]} in every cell:\n\n"
+            f"Each cell of the first table has {len(_SEEDS)} episodes from seed {_SEEDS[0]} on:\n\n"
             + _table(common, [label for label in expected if not _is_other_level(label)])
         )
     if any(_is_other_level(label) for label, _ in common):
         parts.append(
-            f"The other levels, on at least the first {_FEWEST} of these seeds, with the number of "
-            "objects:\n\n"
+            f"The other levels were run on at least the first {_FEWEST} of these seeds. Each cell "
+            "ends with the number of objects:\n\n"
             + _table(common, [label for label in expected if _is_other_level(label)], counted=True)
         )
     needless = _needless_table(common, list(expected))
@@ -92,7 +92,8 @@ def robustness_table(runs: Sequence[Run]) -> str:
         )
     if further:
         parts.append(
-            "All seeds together, where more were run, with the number of objects:\n\n"
+            "All seeds together are in the last table, for the cells that were run on more seeds. "
+            "Each cell ends with the number of objects:\n\n"
             + _table(found, [label for label in expected if label in further], counted=True)
         )
     return "\n".join(parts) or "No runs yet.\n"
