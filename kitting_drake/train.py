@@ -348,9 +348,10 @@ def _split(
 
 
 def _most_unrelated(data: TrainingData, wanted: int) -> int:
-    """Returns how many of the first items to train on, so that the later ones are unrelated.
+    """Returns how many of the first items to train on.
 
-    It is the largest such number that is at most `wanted`, or `wanted` if there is none.
+    It is the largest number, up to `wanted`, after which the data can be split into unrelated parts
+    (see `TrainingData.unrelated`). If there is no such number, it is `wanted`.
     """
     return max((end for end in data.unrelated if end <= wanted), default=wanted)
 

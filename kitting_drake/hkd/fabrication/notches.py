@@ -96,7 +96,7 @@ def _is_wall_between(one: CrossSection, other: CrossSection, cavity: Cavity, wal
 def _beside(
     kit: Kit, index: int, cavity: Cavity, slide: float
 ) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Yields pairs of points on the cavity's walls on both sides of the grasp.
+    """Yields the points on the cavity's walls on both sides of the grasp.
 
     Args:
         kit: the kit.

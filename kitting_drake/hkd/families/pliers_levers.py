@@ -23,8 +23,8 @@ from kitting_drake.hkd.tools.solids import (
     without_holes,
 )
 
-# Tolerances of the hulls of full-size pliers, in mm: for the outline, and for heights. Then the
-# inset of the hulls of a sleeve, because chords stick out of the sleeve's concave side.
+# Tolerances of the hulls of full-size pliers, in mm: for the outline, and for heights. The hulls of
+# a sleeve are inset, because chords stick out of its concave side.
 _OUTLINE_MM, _HEIGHT_MM, _INSET_MM = 0.22, 1.0, 0.08
 
 

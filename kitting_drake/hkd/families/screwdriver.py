@@ -176,7 +176,7 @@ def _offset_driver(p: ScrewdriverParameters) -> list[Part]:
 
 
 def _shaft(p: ScrewdriverParameters) -> Shape:
-    """Builds the hidden end in the handle, the round shaft and the flat tip, which widens and is
+    """Builds the round shaft with its end inside the handle, and the flat tip, which widens and is
     then ground to a blunt edge."""
     radius, end = p.shaft_diameter_mm / 2, p.shaft_length_mm
     start = end - p.tip_length_mm

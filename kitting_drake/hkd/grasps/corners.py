@@ -16,9 +16,9 @@ LEAST_WIDTH = 0.008
 
 # The depth to which a corner sinks into a pad, in metres.
 _SOFT = 0.0008
-# A corner opposite a face is held firmly if the face supports the pad over the first length, in
+# A corner opposite a face is held firmly if the face supports the pad over `_CORNER_MARGIN`, in
 # metres, to either side of the corner. Two opposite corners are held if they are offset along the
-# pads by at most the second length.
+# pads by at most `_CORNER_OFFSET`.
 _CORNER_MARGIN, _CORNER_OFFSET = 0.002, 0.0005
 # A taper is held if its faces lean by at most this slope, measured over this length in metres.
 _TAPER, _TAPER_LENGTH = float(np.tan(np.radians(24.0))), 0.004

@@ -11,8 +11,7 @@ _AREA = 0.02
 # The number of points through which to try a cut, and the number of angles at each point.
 _CORNERS, _ANGLES = 6, 8
 _FAR = 1e3
-# Cells smaller than the first number are not cut again. Cutting stops at the second number of
-# cells.
+# Cells smaller than `_SMALLEST_MM` are not cut again. Cutting stops at `_MOST_CELLS` cells.
 _SMALLEST_MM, _MOST_CELLS = 1.0, 150
 # Steps by which the edges of the final polygons are moved outward, in turn.
 _PUSHES_MM = (0.8, 0.4, 0.2, 0.1)

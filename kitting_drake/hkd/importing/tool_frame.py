@@ -12,13 +12,14 @@ from kitting_drake.hkd.tools.stable_pose import StablePose, stable_poses
 
 Array = NDArray[np.float64]
 
-# For a solid about 180 mm long. Stable poses count as equally low if their centres of mass are
-# within the first number of the lowest one. Of these, the pose with the broadest support is chosen.
-# Supports are compared after rounding to multiples of the second number.
+# These numbers are for a solid about 180 mm long. Stable poses count as equally low if their
+# centres of mass are within `_EQUAL_HEIGHT_MM` of the lowest one. Of these, the pose with the
+# broadest support is chosen. Supports are compared after rounding to multiples of
+# `_MARGIN_STEP_MM`.
 _EQUAL_HEIGHT_MM, _MARGIN_STEP_MM = 0.3, 0.5
 # A tool's direction is found by votes of its edges: each edge votes for the directions near its
-# own, with a Gaussian weight. First the largest angle between the result and the axis of least
-# inertia, then the standard deviation of the Gaussian.
+# own, with a Gaussian weight. `_SIDEWAYS_DEG` is the largest angle between the result and the axis
+# of least inertia, and `_LIKE_DEG` the standard deviation of the Gaussian.
 _SIDEWAYS_DEG, _LIKE_DEG = 25.0, 6.0
 _END = 0.3
 """The length of an end, as a share of the tool's length."""

@@ -185,7 +185,7 @@ def cover(
             round(sum(merged[i].volume for i in members & open_hulls), 3) for _, members in grown
         ]
         _, members = grown[int(np.argmax(gains))]
-        # Span only the uncovered members, because other hulls cover the rest.
+        # Make the hull of the uncovered members only, because other hulls cover the others.
         wanted = np.vstack([merged[i].points for i in sorted(members & open_hulls)])
         result.append(wanted)
         open_hulls -= members

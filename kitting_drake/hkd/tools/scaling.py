@@ -142,7 +142,7 @@ def scaled_sdf(text: str, directory: Path, factor: float) -> str:
     root = ElementTree.fromstring(text)
     for geometry in root.iter("geometry"):
         if [child.tag for child in geometry] != ["mesh"]:
-            raise ValueError("a geometry is not exactly one mesh")
+            raise ValueError("a geometry must be exactly one mesh")
     for mesh in root.iter("mesh"):
         uri = mesh.find("uri")
         if uri is None or not uri.text:

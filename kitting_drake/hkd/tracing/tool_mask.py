@@ -70,8 +70,8 @@ def tool_mask(cv2: Any, ratio: Array, ground: Array, spread: float, px_per_mm: f
     usual = _median(rough[plain & ground], _ROUGH)
     even = (free & (rough < max(_ROUGH, 3 * usual))) | ~ground
     reached = _reached(cv2, even, plain, px_per_mm)
-    # A hole may lie wholly in shadow, close to edges. A median filter does not take these edges for
-    # roughness.
+    # A hole may lie wholly in shadow, so its edges are close. A median filter keeps edges, so they
+    # do not count as roughness.
     finely = _roughness(cv2, light, cv2.medianBlur(light, 5), px_per_mm)
     limit = 1.7 * _median(finely[plain & ground], _ROUGH) * np.exp(-lightness / 2)
     like_ground = (colour < _NEUTRAL * noise) & (finely < limit)

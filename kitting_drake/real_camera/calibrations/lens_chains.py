@@ -83,7 +83,9 @@ def _from_first(node: dict[str, Any], name: str, path: Path) -> Array:
     X = np.eye(4)
     for item in ordered[1 : ordered.index(last) + 1]:
         if "T_cn_cnm1" not in cameras[item]:
-            raise UserError(f"{file}: {item} lacks T_cn_cnm1, the chain from the camera before it")
+            raise UserError(
+                f"{file}: {item} lacks T_cn_cnm1, the transform from the previous camera"
+            )
         # T_cn_cnm1 maps points from the previous camera to this one.
         X = pose_of_value(cameras[item]["T_cn_cnm1"], f"{file}: {item}: T_cn_cnm1").X @ X
     return X

@@ -142,7 +142,7 @@ def matrix(value: Any, rows: int, cols: int, where: str) -> Array:
     """Returns a value as an array of finite numbers with the shape (rows, cols); see `numbers`.
 
     Raises:
-        UserError: the number of numbers is wrong.
+        UserError: the value has more or fewer numbers.
     """
     flat = numbers(value, where)
     if flat.size != rows * cols:

@@ -106,7 +106,7 @@ def read_npz(path: Path, depth_scale: float) -> tuple[NDArray[np.uint8], NDArray
             raise UserError(f"{path} is damaged: {error}") from error
     if color.dtype != np.uint8 or color.ndim != 3 or color.shape[2] not in (3, 4):
         raise UserError(
-            f"{path}: {names[0]} must be (height, width, 3) of bytes, not {color.shape} of "
+            f"{path}: {names[0]} must be bytes of shape (height, width, 3), not {color.shape} of "
             f"{color.dtype}"
         )
     color = np.ascontiguousarray(color[:, :, :3])

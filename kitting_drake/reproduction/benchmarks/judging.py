@@ -22,8 +22,8 @@ _SPACING = 0.002
 """The distance between the points of an outline, in metres."""
 _TOUCHED, _HELD = 4e-6, 2e-5
 """Areas of overlap in square metres, seen from above. A finger touches an object if they overlap by
-more than the first. The jaws hold an object if the part of it between the pads is larger than the
-second."""
+more than `_TOUCHED`. The jaws hold an object if the part of it between the pads is larger than
+`_HELD`."""
 PLACE_OFF = 0.0035
 """The largest distance, in metres, of 95 % of the placed outline from the outline at the goal, for
 a right place."""

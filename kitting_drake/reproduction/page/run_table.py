@@ -99,7 +99,10 @@ def _write(folder: Path, rows: Mapping[str, Summary], lines: Mapping[str, Summar
 
 
 def _columns(rows: Iterable[Mapping[str, str]]) -> list[str]:
-    """Returns the columns of all rows; a column that earlier rows lack follows its neighbour."""
+    """Returns the columns of all rows.
+
+    A column that is new in a row is inserted after its left neighbour in that row.
+    """
     columns: list[str] = []
     for row in rows:
         place = 0

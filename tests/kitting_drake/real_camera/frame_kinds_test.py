@@ -321,7 +321,7 @@ def both_kinds(folder: Path) -> None:
         (truncated(write_compressed_pcd), "front.pcd: it is not a complete PCD file"),
         (truncated(write_compressed_pcd, 0.1), "front.pcd: it is not a complete PCD file"),
         (npz(depth=DEPTH), "must hold the arrays color and depth, not depth"),
-        (npz(color=COLOR.astype(float), depth=DEPTH), "of bytes, not .* of float64"),
+        (npz(color=COLOR.astype(float), depth=DEPTH), "must be bytes of shape .* of float64"),
         (npz(color=COLOR, depth=DEPTH[None]), "front.npz: depth must have one channel, not 8"),
         (npz(color=COLOR[:3], depth=DEPTH), "front.npz is 8x3 pixels, but camera front was"),
         (both_kinds, "has both front.npz and color.png: keep one frame only"),

@@ -29,8 +29,8 @@ _SAME_MM = 0.05
 _LEAST_AREA_MM2 = 1.0
 _LINE_MM = 1.5
 """The width in mm below which two outlines count as the two sides of one thick line."""
-# A rectangle counts as a page or frame if its sides are at least the first number times the page's,
-# and the next largest curve is at least the second number times as long as the rectangle.
+# A rectangle counts as a page or frame if its sides are at least `_PAGE` times the page's, and the
+# next largest curve is at least `_SPANS` times as long as the rectangle.
 _PAGE, _SPANS = 0.85, 0.4
 
 Points = NDArray[np.float64]
@@ -200,7 +200,8 @@ def _without_doubles(curves: list[Points]) -> list[int]:
         for other in around[within.all(axis=1)]:
             if other not in trees:
                 trees[other] = cKDTree(_dense(curves[other], _SAME_MM))
-            # Add half the spacing of the dense points to the distance.
+            # The nearest place may lie between two of the dense points, so allow a little more than
+            # `_SAME_MM`.
             if trees[other].query(places)[0].max() <= 1.2 * _SAME_MM:
                 break
         else:

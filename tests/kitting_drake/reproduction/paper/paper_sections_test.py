@@ -201,13 +201,11 @@ def test_the_tried_learning_rates_are_listed(runs: tuple[Run, ...]):
     text = sections(runs, rates)
     assert (
         "- the Transporter, unseen: 0.0003, chosen from 0.001 (4.00 mm), 0.0003 (2.50 mm), "
-        "0.01 (diverged)"
-        in text
+        "0.01 (diverged)" in text
     )
     assert (
         "- the Transporter, stack_block_pyramid: 0.001, chosen from 0.001 (9.25 nats), "
-        "0.0003 (12.00 nats)"
-        in text
+        "0.0003 (12.00 nats)" in text
     )
 
 
