@@ -17,7 +17,7 @@ from systems.grasp import Grasp
 
 THINNEST_MM, HIGHEST_MM = 4.0, 45.0
 
-# The number of other grasps to keep, and the largest cost above that of the best grasp.
+# The number of other grasps to keep, and how much more than the best grasp they may cost.
 _OTHERS, _MUCH_WORSE = 3, 2.0
 
 UNITS_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "inches": 25.4}

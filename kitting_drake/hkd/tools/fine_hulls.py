@@ -1,7 +1,7 @@
 """Collision hulls that follow a tool's outline closely, for cavities with little clearance.
 
-Lengths are in mm. The outline from above is cut into convex cells. Each hull is the hull of the
-part of the solid above or below one cell, so no hull sticks out beyond the outline.
+Lengths are in mm. The outline from above is cut into convex cells. Each hull
+encloses the part of the solid that lies above one cell, so no hull sticks out beyond the outline.
 """
 
 from collections.abc import Sequence

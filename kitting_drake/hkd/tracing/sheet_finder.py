@@ -146,9 +146,9 @@ def _crossing(first: Array, second: Array) -> Array | None:
 
 
 def _refined(cv2: Any, gray: Any, corners: Array) -> SheetQuad | None:
-    """The quadrilateral with its edges at the steepest change of lightness.
+    """Moves the edges of a quadrilateral to the steepest changes of lightness nearby.
 
-    A sheet is lighter than the desk all round, or darker all round.
+    A sheet is assumed to be lighter than the desk on all sides, or darker on all sides.
     """
     quads = [
         quad

@@ -57,7 +57,7 @@ def _pose_of_parts(value: dict[str, Any], where: str) -> FoundPose:
     refuse_unknown(value, (*_POSITIONS, *_ROTATIONS), where)
     at = refuse_two(value, _POSITIONS, where)
     if at is None:
-        raise UserError(f"{where} has no position: three numbers in metres")
+        raise UserError(f"{where} has no position: give three numbers in metres")
     position = matrix(value[at], 1, 3, f"{where}.{at}")[0]
     key = refuse_two(value, _ROTATIONS, where)
     if key is None:

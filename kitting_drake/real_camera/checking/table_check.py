@@ -165,8 +165,9 @@ def _points(
 def _is_range(
     camera: BenchCamera, depth: NDArray[np.float32], calibration: Calibration, fit: TableFit
 ) -> bool:
-    """Whether the depths seem to be distances from the camera: only if they are read so, the table
-    is flat."""
+    """Whether the depths seem to be distances from the camera.
+
+    Then the table is flat only if they are converted to depths."""
     if fit.plane.noise < _FLAT / 4:
         return False
     points = _points(camera, camera.X_BC, _as_depth(camera, depth), calibration)

@@ -40,7 +40,7 @@ def check_frame(frame: Frame, camera: BenchCamera) -> Frame:
     if frame.color.ndim != 3 or frame.color.shape[2] < 3 or frame.color.dtype != np.uint8:
         raise UserError(f"colour of camera {camera.name} must be (height, width, 3) of bytes")
     if not np.issubdtype(frame.depth.dtype, np.floating):
-        raise UserError(f"depth of camera {camera.name} must be metres in floating point")
+        raise UserError(f"depth of camera {camera.name} must be floating-point numbers in metres")
     return Frame(frame.color, np.ascontiguousarray(frame.depth, np.float32))
 
 

@@ -119,7 +119,9 @@ def load_trajectory(path: Path) -> ArmTrajectory:
         points = content["joint_trajectory"]["points"]
         arrays = [np.array([point[kind] for point in points], dtype=float) for kind in _KINDS]
         if any(it.shape != (len(points), JOINTS) or not np.isfinite(it).all() for it in arrays):
-            raise ValueError("each point needs seven finite numbers of each kind")
+            raise ValueError(
+                "each point must have seven finite positions, velocities and accelerations"
+            )
         if len(points) < 2:
             raise ValueError("it has fewer than two points")
         q, v, a = arrays

@@ -47,7 +47,7 @@ class Changeable:
 
     @property
     def text(self) -> str:
-        """The numbers as text."""
+        """The number of changeable actions and the number of all actions, as text."""
         if self.at_least == self.at_most:
             return f"{self.at_most} of {self.actions}"
         return f"{self.at_least} to {self.at_most} of {self.actions}"
@@ -59,11 +59,11 @@ def changeable(summary: Mapping[str, Any]) -> Changeable:
     Newer summaries have this count. An older one has only the number F of failed grasps in E
     episodes. At most n = min(F, E) of these episodes have a failed grasp. This gives two bounds:
 
-    - At least F - n actions follow a failed grasp. In each episode, all failed grasps but the first
-    do.
-    - At most all actions of n episodes do, except the first action of each, which is the failed
-    one. In the other episodes each placed object took an action. So the bound is largest if the n
-    episodes are those with the fewest placed objects.
+    - At least F - n actions follow a failed grasp: in each episode, all failed grasps but the first
+      one follow it.
+    - At most all actions of n episodes follow a failed grasp, except the first action of each, which
+      is the failed one. In the other episodes each placed object took an action. So the bound is
+      largest if the n episodes are those with the fewest placed objects.
 
     Args:
         summary: the summary that `evaluate` wrote for a learned policy. If it has no number of

@@ -76,7 +76,7 @@ def original_parameters(method: str) -> int:
 
 
 def parameters_section() -> str:
-    """Writes the table and its text, in Markdown."""
+    """Writes the table of parameters, with an explanation, in Markdown."""
     rows = []
     for method in LEARNED:
         by_counts: dict[tuple[int | None, ...], list[str]] = {}

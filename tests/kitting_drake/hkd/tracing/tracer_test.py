@@ -94,7 +94,7 @@ def test_a_tool_over_the_edge_of_the_sheet_is_not_cut_off_silently(tmp_path: Pat
 def test_letter_is_told_from_a4(tmp_path: Path):
     path = photo_of(tmp_path, spanner(), sheet=(279.4, 215.9), tilt=15)
     assert "279.4 x 215.9" in traced(path).notes[0]
-    with pytest.raises(UserError, match="sides as"):
+    with pytest.raises(UserError, match="sides of the largest sheet"):
         traced(path, sheet_mm=(297.0, 210.0))
 
 
@@ -104,7 +104,7 @@ def test_letter_is_told_from_a4(tmp_path: Path):
         ({"tilt": 36.0, "distance": 520.0}, "degrees from the vertical"),
         ({"blur": 9.0}, "blurred"),
         ({"sheet": (1500.0, 1200.0)}, "no sheet"),
-        ({"sheet": (210.0, 210.0)}, "sides as"),
+        ({"sheet": (210.0, 210.0)}, "sides of the largest sheet"),
     ],
 )
 def test_a_poor_photo_is_refused_in_a_sentence(spec: dict, reason: str, tmp_path: Path):
