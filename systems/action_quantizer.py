@@ -13,16 +13,16 @@ class ActionQuantizer:
     """Rounds positions to pixel centres and rotations to N orientations."""
 
     grid: PixelGrid
-    """Positions are rounded to the centres of its pixels."""
+    """The pixel grid; positions are rounded to the centres of its pixels."""
     orientations: int
-    """N: angles are rounded to multiples of 2 pi / N."""
+    """N, the number of orientations; angles are rounded to multiples of 2 pi / N."""
 
     def position(self, x: float, y: float) -> tuple[float, float]:
-        """The nearest pixel centre, in metres."""
+        """The pixel centre (x, y) nearest to a point, both in metres in the world."""
         pixel = np.clip(np.round(self.grid.to_pixel((x, y))), 0, np.array(self.grid.shape) - 1)
         rounded_x, rounded_y = self.grid.to_world(pixel)
         return float(rounded_x), float(rounded_y)
 
     def angle(self, theta: float) -> float:
-        """The nearest of the N orientations, in radians."""
+        """The one of the N orientations that is nearest to an angle, both in radians."""
         return round(theta * self.orientations / math.tau) * math.tau / self.orientations

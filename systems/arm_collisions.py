@@ -1,4 +1,4 @@
-"""Where a Franka arm would collide: capsules around its links and its hand."""
+"""Detects collisions of a Franka arm, with capsules around its links and its hand."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from systems.hand_geometry import FINGERTIP_DISTANCE, PALM_SIZE
 
 @dataclass(frozen=True)
 class Capsule:
-    """All points within a radius of a line segment; in metres."""
+    """All points within `radius` of the line segment from `start` to `end`, in metres."""
 
     start: tuple[float, float, float]
     end: tuple[float, float, float]
@@ -23,7 +23,8 @@ class Capsule:
 
 @dataclass(frozen=True)
 class _Link:
-    """A capsule in the frame of a joint (from 0); frame 7 is the flange's."""
+    """A capsule fixed to a joint's frame: frames 0 to 6 belong to joints 1 to 7, frame 7 to the
+    flange."""
 
     frame: int
     capsule: Capsule
@@ -32,8 +33,8 @@ class _Link:
 _COS, _SIN = float(np.cos(HAND_TURN)), float(np.sin(HAND_TURN))
 _HALF_PALM = PALM_SIZE[1] / 2 - PALM_SIZE[0] / 2
 
-# The links of a Franka, by their drawings and meshes: no point of a mesh is outside of its capsule
-# by more than 15 mm.
+# The links of a Franka, measured from its drawings and meshes. No point of a mesh lies more than
+# 15 mm outside its capsule.
 _BASE = (
     Capsule((-0.10, 0.0, 0.06), (0.0, 0.0, 0.06), 0.09),
     Capsule((0.0, 0.0, 0.06), (0.0, 0.0, 0.333), 0.08),
@@ -52,11 +53,11 @@ _HAND = _Link(
 _UPPER_ARM = _Link(2, Capsule((0.0, 0.0, -0.20), (0.0, 0.0, -0.06), 0.06))
 _ELBOW = _Link(3, Capsule((0.0, 0.0, -0.06), (0.0, 0.0, 0.06), 0.06))
 _ABOVE = (_ELBOW, _FOREARM, _WRIST, _LAST)
-"""What may come down onto the surfaces, besides the hand."""
+"""The links, besides the hand, that could come down onto the table and the objects."""
 _OUTER = (_FOREARM, _WRIST, _LAST, _HAND)
-"""What may come back to the arm's own base."""
+"""The links that could hit the arm's own base."""
 _LEAST = 0.01
-"""Least distance, in m."""
+"""Smaller distances count as collisions, in m."""
 
 
 def collision(
@@ -66,15 +67,15 @@ def collision(
     obstacles: Sequence[Capsule] = (),
     held: float = 0.0,
 ) -> str:
-    """What the arm collides with at one of several joint positions; empty if with nothing.
+    """Names what the arm collides with at any of several joint positions; empty if nothing.
 
     Args:
-        q: (n, 7).
-        base: where the arm stands.
-        surface: height of the highest surface around the hand in the world, in m. The hand itself
-            is not compared: fingers must go below it.
-        obstacles: bodies that do not move, in the world.
-        held: how far a held object reaches from the fingertips, in m.
+        q: (n, 7) joint positions, in rad.
+        base: pose of the arm's base in the world.
+        surface: world z of the highest surface around the hand, in m. The hand itself is not
+            compared with it, because the fingers must go below it.
+        obstacles: capsules around bodies that do not move, in the world.
+        held: how far a held object reaches from the fingertips, in m; zero if there is none.
     """
     rotations, origins = joint_frames(q)
 
@@ -109,7 +110,8 @@ def collision(
 def _distances(
     a: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64], d: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """(n) distances between the segments a to b and c to d, each (n, 3) or (3)."""
+    """(n) distances, in m, between the line segments from a to b and from c to d; each point is
+    (n, 3) or (3)."""
     u, v, w = b - a, d - c, a - c
     uu, vv, uv = np.sum(u * u, -1), np.sum(v * v, -1), np.sum(u * v, -1)
     uw, vw = np.sum(u * w, -1), np.sum(v * w, -1)

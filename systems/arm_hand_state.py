@@ -11,7 +11,8 @@ _FINGERS = 2
 
 
 class ArmHandState(LeafSystem):
-    """The state of the hand, as if it floated.
+    """Converts the joint state of an arm to the state that a floating hand at the same pose would
+    have.
 
     .. pydrake_system::
 
@@ -30,7 +31,7 @@ class ArmHandState(LeafSystem):
     def __init__(self, base: ArmBase) -> None:
         """
         Args:
-            base: where the arm stands.
+            base: pose of the arm's base in the world.
         """
         super().__init__()
         self._base = base
@@ -38,7 +39,7 @@ class ArmHandState(LeafSystem):
         self.DeclareVectorOutputPort("hand_state", 12, self._calc_state)
 
     def _calc_state(self, context: Context, output: BasicVector) -> None:
-        # Plain floats: this runs at every step.
+        # Use plain floats instead of NumPy for speed: this runs at every step.
         state = self._robot_state.Eval(context).tolist()
         size = JOINTS + _FINGERS
         found = hand_state(state[:JOINTS], state[size : size + JOINTS], self._base)

@@ -1,4 +1,4 @@
-"""The inertia of a Franka arm and its hand, felt in the joints."""
+"""Computes the torques that accelerate a Franka arm and its hand."""
 
 from __future__ import annotations
 
@@ -10,28 +10,30 @@ from numpy.typing import NDArray
 from systems.arm_limits import JOINTS
 
 if TYPE_CHECKING:
-    # The planning of motions works without Drake.
+    # Motions can be planned without Drake, so import it for type checks only.
     from pydrake.multibody.plant import MultibodyPlant
 
 _POINTS = 9
-"""At so many points of a motion the mass matrix is computed; it is interpolated in between."""
+"""Number of points of a motion at which the mass matrix is computed; it is interpolated in
+between."""
 
 
 class ArmInertia:
-    """Tells how fast the torques change in a motion."""
+    """Computes mass matrices, and from them the joint torques along a motion."""
 
     def __init__(self, arm: MultibodyPlant) -> None:
         """
         Args:
-            arm: a plant of nothing but the arm and its hand; the joints come before the fingers.
+            arm: a plant that contains only the arm and its hand; the joints come before the
+                fingers.
         """
         self._arm = arm
-        # Scratch memory: no value outlives the call that sets it.
+        # Scratch memory: each call overwrites the values before it reads them.
         self._scratch = arm.CreateDefaultContext()
         self._positions = arm.GetPositions(self._scratch)
 
     def mass(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(7, 7) mass matrix of the joints at joint positions (7)."""
+        """(7, 7) joint-space mass matrix, in SI units, at joint positions (7) in rad."""
         positions = self._positions.copy()
         positions[:JOINTS] = q
         self._arm.SetPositions(self._scratch, positions)
@@ -40,10 +42,12 @@ class ArmInertia:
     def torques(
         self, q: NDArray[np.float64], acceleration: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """(n, 7) torques that accelerate the joints in a motion, without Coriolis terms, in N m.
+        """(n, 7) torques M(q) a that accelerate the joints in a motion, in N m. Coriolis and
+        gravity terms are left out.
 
         Args:
-            q: (n, 7) positions in the order of the motion. Likewise `acceleration`.
+            q: (n, 7) joint positions in the order of the motion, in rad.
+            acceleration: (n, 7) joint accelerations, in rad/s^2.
         """
         at = np.linspace(0, len(q) - 1, min(_POINTS, len(q))).astype(int)
         masses = np.array([self.mass(q[i]) for i in at])

@@ -6,8 +6,8 @@ is Rot_x(alpha) Trans_x(a) Rot_z(q) Trans_z(d); source: Franka's FCI documentati
 
 Frames: B is the arm's base, F its flange, G the gripper frame of `systems.hand_geometry`. A hand
 pose is (x, y, z, yaw) of G in the world: the hand's z axis points down, its x axis along
-(cos yaw, sin yaw). Then the last joint's axis is vertical, so that a rotation of the hand by some
-angle is a rotation of joint 7 by the opposite angle.
+(cos yaw, sin yaw). The last joint's axis is then vertical, so joint 7 turns the hand about its own
+vertical axis: a yaw of +a needs a joint rotation of -a.
 """
 
 from __future__ import annotations
@@ -28,20 +28,22 @@ HAND_TURN = -math.pi / 4
 _A = (0.0, 0.0, 0.0, _A4, -_A4, 0.0, _A7)
 _D = (_D1, 0.0, _D3, 0.0, _D5, 0.0, 0.0)
 _TWIST = (0.0, -1.0, 1.0, 1.0, -1.0, 1.0, 1.0)
-"""sin(alpha) of each joint; cos(alpha) is 1 for the first and 0 for the others."""
+"""sin(alpha) of each joint's Denavit-Hartenberg twist; cos(alpha) is 1 for the first and 0 for the
+others."""
 _HAND_X = (math.cos(HAND_TURN), math.sin(HAND_TURN))
-"""The hand's x axis in the flange's x and y."""
+"""The hand's x axis, as x and y components in the flange's frame."""
 TIP_DISTANCE = _D_FLANGE + FINGERTIP_DISTANCE
-"""From the axis of joint 6 to the fingertip ends, along the axis of joint 7, in m."""
+"""Distance from the axis of joint 6 to the fingertip ends, along the axis of joint 7, in m."""
 
 _UPPER, _FORE = math.hypot(_D3, _A4), math.hypot(_D5, _A4)
-"""Distances from the elbow (the axis of joint 4) to shoulder and wrist, in m."""
+"""Distances from the elbow (the axis of joint 4) to the shoulder and to the wrist, in m."""
 BRANCHES = 8
 
 
 @dataclass(frozen=True)
 class ArmBase:
-    """Where the arm stands: x, y, z in m and yaw in rad of B in the world, z up."""
+    """Pose of the arm's base frame B in the world: x, y, z in m and yaw in rad; B's z axis points
+    up."""
 
     x: float = 0.0
     y: float = 0.0
@@ -49,34 +51,34 @@ class ArmBase:
     yaw: float = 0.0
 
     def to_base(self, pose: ArrayLike) -> NDArray[np.float64]:
-        """(..., 4) hand poses x, y, z, yaw in the base instead of the world."""
+        """Transforms hand poses (..., 4), as x, y, z, yaw in m and rad, from the world to B."""
         x, y, z, yaw = np.moveaxis(np.asarray(pose, dtype=float), -1, 0)
         cos, sin = math.cos(self.yaw), math.sin(self.yaw)
         dx, dy = x - self.x, y - self.y
         return np.stack([cos * dx + sin * dy, cos * dy - sin * dx, z - self.z, yaw - self.yaw], -1)
 
     def to_base_points(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(..., 3) points in the base instead of the world."""
+        """Transforms points (..., 3) from the world to B, in m."""
         cos, sin = math.cos(self.yaw), math.sin(self.yaw)
         rotation = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
         return (points - (self.x, self.y, self.z)) @ rotation
 
     def to_world(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(..., 3) points in the world instead of the base."""
+        """Transforms points (..., 3) from B to the world, in m."""
         cos, sin = math.cos(self.yaw), math.sin(self.yaw)
         rotation = np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
         return points @ rotation + (self.x, self.y, self.z)
 
 
 def joint_frames(q: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Forward kinematics.
+    """Forward kinematics of all joints and the flange.
 
     Args:
         q: (..., 7) joint positions, in rad.
 
     Returns:
-        (..., 8, 3, 3) rotations and (..., 8, 3) origins of the seven joints' frames, whose z is
-        the joint's axis, and of the flange, in B.
+        (..., 8, 3, 3) rotations and (..., 8, 3) origins, in m, of the frames of the seven joints
+        and of the flange, in B. The z axis of a joint's frame is the joint's axis.
     """
     shape = np.shape(q)[:-1]
     rotations, origins = np.empty((*shape, 8, 3, 3)), np.empty((*shape, 8, 3))
@@ -98,7 +100,8 @@ def joint_frames(q: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[n
 
 
 def fingertips(q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(..., 3) the point midway between the fingertip ends in B, of joint positions (..., 7)."""
+    """(..., 3) the point midway between the fingertip ends in B, in m, at joint positions
+    (..., 7)."""
     x = y = np.zeros(np.shape(q)[:-1])
     z = x + TIP_DISTANCE
     cos, sin = np.cos(q), np.sin(q)
@@ -111,7 +114,8 @@ def fingertips(q: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def jacobian(q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(..., 6, 7): rotational, then translational velocity of the fingertips in B, by joint."""
+    """(..., 6, 7) Jacobian at joint positions (..., 7), in B: three rows of angular velocity, then
+    three of the fingertips' translational velocity."""
     rotations, origins = joint_frames(q)
     axes = rotations[..., :7, :, 2]
     tip = origins[..., 6, None, :] + TIP_DISTANCE * rotations[..., 6, None, :, 2]
@@ -120,16 +124,17 @@ def jacobian(q: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def hand_state(q: list[float], v: list[float], base: ArmBase) -> list[float]:
-    """x, y, z, yaw of the hand in the world, then their rates; in plain floats, for every step.
+    """Pose of the hand in the world, as x, y, z, yaw in m and rad, then the rates of these four.
 
-    If the hand does not point straight down, the yaw is that of the projection of its x axis.
+    If the hand does not point straight down, the yaw is that of the projection of its x axis. The
+    computation uses plain floats, which is faster for a call at every step.
 
     Args:
         q: seven joint positions, in rad.
-        v: their velocities, in rad/s.
-        base: where the arm stands.
+        v: seven joint velocities, in rad/s.
+        base: pose of the arm's base in the world.
     """
-    # A point p and a direction h of the hand, with their rates, from frame 7 inwards.
+    # The hand's position p and x axis h with their rates, transformed from frame 7 to frame 1.
     px = py = 0.0
     pz, hx, hy, hz = TIP_DISTANCE, _HAND_X[0], _HAND_X[1], 0.0
     dpx = dpy = dpz = dhx = dhy = dhz = 0.0
@@ -158,7 +163,7 @@ def hand_state(q: list[float], v: list[float], base: ArmBase) -> list[float]:
 
 
 def joint_seven(wrist: ArrayLike, yaw: ArrayLike) -> NDArray[np.float64]:
-    """q7 of a hand that points down, in (-pi, pi].
+    """Position of joint 7 in (-pi, pi], in rad, at which a hand that points down has a given yaw.
 
     Args:
         wrist: azimuth in B from the wrist (joint 6) to the hand's vertical axis, in rad.
@@ -169,18 +174,20 @@ def joint_seven(wrist: ArrayLike, yaw: ArrayLike) -> NDArray[np.float64]:
 
 
 def planar(tip: NDArray[np.float64], q7: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The joint positions of an arm in the vertical plane through its base and the hand.
+    """The joint positions at which the whole arm lies in the vertical plane of its base and the
+    hand.
 
-    Joints 3 and 5 are at zero. It is one of the solutions of `inverse`, also where that is singular
-    because shoulder and elbow are on a vertical line. Between two such positions, the hand points
-    down all along a straight line in joint space.
+    Joints 3 and 5 are at zero. This is one of the solutions of `inverse`. It also exists when the
+    elbow is straight above the shoulder, where `inverse` is singular. On a straight line in joint
+    space between two such positions the hand points down all the way.
 
     Args:
         tip: (..., 3) the point midway between the fingertip ends, in B.
-        q7: (...) in rad.
+        q7: (...) positions of joint 7, in rad.
 
     Returns:
-        (..., 7), NaN where the pose is out of reach. The limits of the joints are not considered.
+        (..., 7) joint positions in rad, NaN where the pose is out of reach. The joints' limits are
+        not considered.
     """
     x, y, z = np.moveaxis(np.asarray(tip), -1, 0)
     across, up = np.hypot(x, y) - _A7, z + TIP_DISTANCE - _D1
@@ -198,20 +205,21 @@ def planar(tip: NDArray[np.float64], q7: NDArray[np.float64]) -> NDArray[np.floa
 def inverse(
     tip: NDArray[np.float64], q7: NDArray[np.float64], yaw: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """All joint positions that bring the hand, pointing down, to a pose; closed form.
+    """All joint positions, in closed form, at which the hand points down and has a given pose.
 
     Args:
         tip: (..., 3) the point midway between the fingertip ends, in B.
-        q7: (...) the free parameter, in rad.
-        yaw: (...) the hand's yaw in B, in rad.
+        q7: (...) positions of joint 7, the free parameter, in rad.
+        yaw: (...) yaws of the hand in B, in rad.
 
     Returns:
-        (..., 8, 7) joint positions by branch: the elbow to either side of the line from shoulder
-        to wrist, two angles of joint 6, two of the shoulder. A branch that does not exist is NaN.
-        The limits of the joints are not considered.
+        (..., 8, 7) joint positions in rad, one row for each of the 2 x 2 x 2 branches: two sides of
+        the line from shoulder to wrist for the elbow, two angles of joint 6, two of the shoulder. A
+        branch that does not exist is NaN. The joints' limits are not considered.
     """
     rotation = np.zeros((*np.shape(q7), 3, 3))
-    # The flange's x axis is the hand's, rotated back by the mounting; its z points down.
+    # The flange's x axis is the hand's, rotated back by the mounting angle. The flange's z axis
+    # points down.
     angle = np.asarray(yaw) + HAND_TURN
     rotation[..., 0, 0] = rotation[..., 1, 1] = np.cos(angle)
     rotation[..., 1, 0] = np.sin(angle)
@@ -225,21 +233,22 @@ def inverse(
 def inverse_of_flange(
     rotation: NDArray[np.float64], origin: NDArray[np.float64], q7: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """All joint positions that bring the flange to a pose; as `inverse`.
+    """All joint positions at which the flange has a given pose, which need not point down.
 
     Args:
-        rotation: (..., 3, 3) of the flange in B.
-        origin: (..., 3) of the flange in B.
-        q7: (...) the free parameter, in rad.
+        rotation: (..., 3, 3) rotations of the flange in B.
+        origin: (..., 3) origins of the flange in B, in m.
+        q7: (...) positions of joint 7, the free parameter, in rad.
 
     Returns:
-        (..., 8, 7).
+        (..., 8, 7) joint positions by branch, as `inverse` returns them.
     """
-    # Frame 7 before its rotation, then frame 6: its x axis, and its z axis.
+    # The axes of frame 7 before its rotation by q7, then the x and z axes of frame 6.
     x, y, z7 = rotation[..., 0], rotation[..., 1], rotation[..., 2]
     c, s = np.cos(q7)[..., None], np.sin(q7)[..., None]
     x6, z6 = c * x - s * y, c * y + s * x
-    # Frame 7 is frame 6 turned by pi/2 about x: z6 is y of the unturned frame 7, y6 its -z.
+    # Before its rotation by q7, frame 7 is frame 6 turned by pi/2 about x. So z6 is its y axis, and
+    # y6 its negative z axis.
     y6 = -z7
     wrist = origin - _D_FLANGE * z7 - _A7 * x6
     shoulder = np.array([0.0, 0.0, _D1])
@@ -266,7 +275,7 @@ def inverse_of_flange(
 _ELBOW = np.array([1.0, 1.0, 1.0, 1.0, -1.0, -1.0, -1.0, -1.0])
 _WRIST = np.array([1.0, 1.0, -1.0, -1.0, 1.0, 1.0, -1.0, -1.0])
 _SHOULDER = np.array([1.0, -1.0] * 4)
-"""The signs of the branches."""
+"""The sign of the shoulder's angle in each of the eight branches."""
 
 
 def _angles(
@@ -279,9 +288,11 @@ def _angles(
     """(..., 8, 6) positions of joints 1 to 6, by branch.
 
     Args:
-        wrist: (..., 1, 3) from the shoulder to the wrist, in m.
-        x6: (..., 1, 3) axis of frame 6; likewise `z6`.
-        z5: (..., 8, 3) axis of frame 5; likewise `z4` of frame 4.
+        wrist: (..., 1, 3) vector from the shoulder to the wrist in B, in m.
+        x6: (..., 1, 3) x axis of frame 6 in B.
+        z6: (..., 1, 3) z axis of frame 6 in B.
+        z5: (..., 8, 3) z axis of frame 5 in B.
+        z4: (..., 8, 3) z axis of frame 4 in B.
     """
     x4, x5 = _cross(z5, z4), _cross(z5, z6)
     elbow = (wrist - _D5 * z5 + _A4 * x4) / _UPPER**2
@@ -301,7 +312,7 @@ def _angles(
 
 
 def _cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """np.cross, several times faster."""
+    """Cross products of vectors (..., 3), several times faster than np.cross."""
     return np.stack(
         [
             a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1],

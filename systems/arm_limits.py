@@ -1,4 +1,4 @@
-"""What the joints of a Franka arm can do, as its maker publishes it."""
+"""Limits of the joints of Franka arms, as their maker publishes them."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ class VelocityEnvelope:
     """
 
     lower: _Seven
-    """q_min, in rad."""
+    """Lower end q_min of each joint's range in this formula, in rad."""
     upper: _Seven
-    """q_max, in rad."""
+    """Upper end q_max of each joint's range in this formula, in rad."""
     offset: _Seven
-    """In rad/s."""
+    """The offset that the formula subtracts for each joint, in rad/s."""
     deceleration: _Seven
-    """d, in rad/s^2."""
+    """The deceleration d of each joint, in rad/s^2."""
 
 
 @dataclass(frozen=True)
@@ -49,12 +49,13 @@ class ArmLimits:
     torque: _Seven
     torque_rate: _Seven
     envelope: VelocityEnvelope | None = None
-    """None: the velocity limits do not depend on the position."""
+    """The velocity limits that depend on the position; None if there are none."""
 
     def velocity_bounds(
         self, q: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """The lowest and highest velocity at joint positions (..., 7), in rad/s."""
+        """The lowest and the highest allowed velocities (..., 7), in rad/s, at joint positions
+        (..., 7)."""
         high = np.broadcast_to(np.array(self.velocity), np.shape(q))
         if self.envelope is None:
             return -high, high
@@ -94,9 +95,8 @@ FR3 = ArmLimits(
     ),
 )
 """Franka Research 3. Source: Franka's FCI documentation, "Robot and interface specifications",
-section "Limits for Franka Research 3": ranges and torques, and the velocity limits that depend on
-the position; the same in libfranka 0.13, `rate_limiting.h`, and in franka_description,
-`robots/fr3/joint_limits.yaml`."""
+section "Limits for Franka Research 3". libfranka 0.13 (`rate_limiting.h`) and franka_description
+(`robots/fr3/joint_limits.yaml`) give the same numbers."""
 
 ARM_LIMITS = {"fr3": FR3, "panda": PANDA}
-"""By the name of the model."""
+"""The limits of each arm, by the name of its model."""

@@ -26,46 +26,48 @@ from systems.signals import PlanarPose
 from systems.vector_view import Array, Number
 
 _KEPT = 8
-"""How many ways are kept in memory."""
+"""How many planned motions are cached."""
 _FARTHEST_STOP = 0.02
-"""A hand that is further away from its command than this stays at its command, in m."""
+"""If a commanded stop is further than this from the hand's pose, in m, the arm brakes where it
+is."""
 _SAME_HEIGHT = 0.003
 
 _HELD_REACH = 0.125
-"""How far a held object reaches from the fingertips, in m: as `read_surface_heights` has it."""
+"""How far a held object reaches from the fingertips at most, in m. `read_surface_heights` assumes
+the same."""
 _JAW_ROOM = 0.005
-"""How far each pad stays from an object of known width before a grasp, in m."""
+"""Distance of each pad from an object of known width before the jaws close, in m."""
 
 _TOUCH_SPEED = 0.011
-"""An arm's limit of `touch_speed`, in m/s. Its hand moves 10 to 25 kg, a floating hand 4 kg,
-and the force of an impact is proportional to mass times speed."""
+"""Upper limit of `touch_speed` for an arm, in m/s. The force of an impact is proportional to mass
+times speed, and the mass that moves with an arm's hand is 10 to 25 kg, that of the floating hand
+4 kg."""
 
 
 class ArmState(PlannerState):
-    """The planner's state with an arm."""
+    """The planner's state, with the additional fields that an arm needs."""
 
     way = Array(WayVector.size)
-    """The present `WayVector`; it began at `way_start`."""
+    """The `WayVector` of the present motion, which began at time `way_start`, in s."""
     way_start = Number()
     pick_joints = Array(JOINTS)
-    """Joint positions above the pick. Likewise above the place."""
+    """Joint positions above the pick, in rad. `place_joints` are those above the place."""
     place_joints = Array(JOINTS)
 
 
 class ArmMotion(JawMotion):
-    """Motions of an arm, jaw openings and closing forces, as functions of the state. See
-    `RobotMotion`.
+    """Implements `RobotMotion` for an arm.
 
-    - `APPROACH`, `LIFT` with `CARRY`, `RETREAT`: ways in joint space, as fast as the joints'
+    - `APPROACH`, `LIFT` with `CARRY`, `RETREAT`: motions in joint space, as fast as the joints'
       limits and the parameters' linear speed and acceleration allow. The hand rises straight up to
-      the clear height, travels above it, and sinks near its goal only, with rounded corners.
+      the clear height, travels above it, and sinks only near its goal. Corners are rounded.
     - `DESCEND`, `LOWER`, `SEARCH`: straight lines of the hand, with the parameters' speeds.
-    - What begins while the arm moves begins with the fastest stop that the limits of acceleration
-      and jerk allow, except `CARRY` after `LIFT`: these two are one way.
+    - A mode that begins while the arm moves first brakes, as fast as the limits of acceleration and
+      jerk allow. The exception is `CARRY` after `LIFT`: these two are one motion.
 
     Position, velocity, acceleration and jerk of all joints are within their limits at all times.
 
-    A way is a pure function of the `WayVector` in the state; the last ones are kept in memory.
+    A motion is a pure function of the `WayVector` in the state. The latest motions are cached.
     """
 
     size = 3 * JOINTS
@@ -82,12 +84,12 @@ class ArmMotion(JawMotion):
     ) -> None:
         """
         Args:
-            parameters: heights, speeds, forces.
-            limits: of the joints.
-            base: where the arm stands.
+            parameters: heights, speeds and forces of the motion primitive.
+            limits: limits of the joints.
+            base: pose of the arm's base in the world.
             obstacles: fixed bodies that the arm must not touch, in the world.
-            highest_wait: the hand waits at the planner's home, but no higher than this, in m.
-            inertia: of the arm; None: the rates of the torques are not limited.
+            highest_wait: upper limit of the height at which the hand waits, in m.
+            inertia: model of the arm's inertia; None: the rates of the torques are not limited.
 
         Raises:
             ValueError: the arm cannot reach the home pose.
@@ -103,7 +105,7 @@ class ArmMotion(JawMotion):
         if problem:
             raise ValueError(f"planner.home: {problem}")
         self.home_joints = found[0]
-        """(7) where the arm waits at first."""
+        """(7) joint positions in which the arm waits at first, in rad."""
         self._way_of = functools.lru_cache(maxsize=_KEPT)(self._make_way)
 
     def initial_state(self) -> NDArray[np.float64]:
@@ -116,7 +118,7 @@ class ArmMotion(JawMotion):
         return vector
 
     def view(self, vector: NDArray[np.float64]) -> ArmState:
-        """The fields of a state vector."""
+        """Names the fields of a state vector, without a copy."""
         return ArmState(vector)
 
     def _make_way(self, vector: bytes) -> ArmWay:
@@ -129,7 +131,7 @@ class ArmMotion(JawMotion):
     # Before an action.
 
     def stops(self, state: PlannerState) -> list[HandStop]:
-        """Where the hand goes down in an action."""
+        """The places at which the hand goes down in the present action."""
         heights = MotionHeights(
             grasp=state.grasp_z,
             clear=state.clear_z,
@@ -151,7 +153,7 @@ class ArmMotion(JawMotion):
         return not self._prepare(self.view(state.vector))
 
     def _prepare(self, state: ArmState) -> str:
-        """Prepares an action; the sentence of `reach_problem`."""
+        """Prepares an action. Returns the sentence of `reach_problem`."""
         now = self._way(state).at(math.inf)[:JOINTS]
         found, problem = self.postures.choose(self.stops(state), now)
         if problem:
@@ -162,7 +164,8 @@ class ArmMotion(JawMotion):
         return self._problem_on_the_ways(state)
 
     def _problem_on_the_ways(self, state: ArmState) -> str:
-        """What the arm would touch on the ways that it will take; empty if nothing."""
+        """A sentence that names what the arm would touch on the planned motions; empty if
+        nothing."""
         trial = self.view(np.array(state.vector))
         now = self._way(trial).at(math.inf)
         surface = float(state.clear_z) - self._parameters.travel_clearance
@@ -182,7 +185,7 @@ class ArmMotion(JawMotion):
     # Modes.
 
     def wide(self, state: PlannerState) -> float:
-        """The opening before a grasp: as wide as the object, and some room, in m."""
+        """The opening of the jaws before a grasp: the object's width plus some clearance, in m."""
         return min(self._parameters.open_width, state.width + 2 * _JAW_ROOM)
 
     def begin(
@@ -221,7 +224,7 @@ class ArmMotion(JawMotion):
             if not state.refused:
                 way.over, way.clear, way.sink = state.pick_joints, state.clear_z, state.pick_hover_z
         elif mode == Mode.LIFT and state.doubts_grip:
-            # A trial, to see how the object hangs.
+            # Lift a little as a trial, to measure how the object's weight pulls on the hand.
             way.line = self.postures.hand_pose(now[:JOINTS])
             way.line[2] = max(state.hold_z + TRIAL, float(way.line[2]))
             way.speeds, way.yaw_speed = limits.speed, limits.yaw_speed
@@ -240,7 +243,7 @@ class ArmMotion(JawMotion):
         z: float | None,
         at: NDArray[np.float64] | None,
     ) -> None:
-        """A straight line of the hand from where it will have stopped."""
+        """Sets the motion to a straight line of the hand that begins where the arm has stopped."""
         parameters, limits = self._parameters, self._limits[mode]
         pose = self.postures.hand_pose(way.start[:JOINTS])
         goal = np.array(pose)
@@ -264,14 +267,16 @@ class ArmMotion(JawMotion):
                 return
             goal = np.array(at)
         elif z is not None and abs(z - pose[2]) < _FARTHEST_STOP:
-            # A payload's sag leaves the hand below its command: to follow it would push.
+            # A payload makes the hand sag below its command. A goal at the sagged height would push
+            # the hand down.
             goal[2] = max(z, float(pose[2]))
         else:
             return
         way.line = goal
 
     def _set_retreat(self, state: ArmState, way: WayVector) -> None:
-        """Up, and back to the home's x; the hand need not return to the home's y and yaw."""
+        """Sets the motion up and back to the x of the home pose. Its y and yaw need not be
+        reached."""
         now = way.start[:JOINTS]
         y = float(self.postures.hand_pose(now)[1])
         x, home_y, _, yaw = self._parameters.home
@@ -285,9 +290,10 @@ class ArmMotion(JawMotion):
                 goal = found[0]
                 break
         way.over, way.sink = goal, z
-        # After a stop the jaws may drag something along.
+        # After a stop by the force guard the jaws may drag an object along, so rise to the higher
+        # travel height.
         way.clear = state.travel_z if state.stops else state.clear_z
-        # Joint 7 stays: it alone would take longer.
+        # Do not turn joint 7 back: it would take longer than the other joints.
         way.over[6] = now[6]
 
     def back_off(self, state: PlannerState, distance: float) -> None:
@@ -299,24 +305,24 @@ class ArmMotion(JawMotion):
         state.duration = self._way(state).duration
 
     def motion_at(self, state: PlannerState, time: float) -> NDArray[np.float64]:
-        """(21) q_d, v_d, a_d of the joints."""
+        """(21) the joints' desired positions, velocities and accelerations."""
         assert isinstance(state, ArmState)
         return self._way(state).at(time - state.way_start)
 
     def hand_acceleration(
         self, state: PlannerState, time: float, desired: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """(3) of the fingertips in the world, in m/s^2."""
+        """(3) acceleration of the fingertips in the world, in m/s^2."""
         assert isinstance(state, ArmState)
         return self._way(state).hand_acceleration(time - state.way_start)
 
     def arrival(self, state: PlannerState) -> float:
-        """When all of the present mode has arrived. See `RobotMotion`."""
+        """The time at which the present mode is complete. See `RobotMotion`."""
         assert isinstance(state, ArmState)
         return self.jaws_arrival(state, state.way_start + self._way(state).duration)
 
     def brakes_above(self, state: PlannerState, time: float, height: float) -> bool:
-        """Whether the hand is above a height; it goes on in `CARRY`."""
+        """Whether the hand is above a height. An arm does not brake between `LIFT` and `CARRY`."""
         q = self.motion_at(state, time)[:JOINTS]
         arrived = time >= self.arrival(state)
         return bool(arrived or self.postures.hand_pose(q)[2] >= height - _SAME_HEIGHT)

@@ -1,4 +1,4 @@
-"""How a Franka arm stands when its hand, pointing down, is at a pose."""
+"""Chooses joint positions of a Franka arm for poses of its hand, which points down."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from systems.arm_kinematics import (
 from systems.arm_limits import JOINTS, ArmLimits
 
 MARGIN = 0.03
-"""How far a posture keeps from the ends of the joints' ranges, in rad."""
+"""Least distance of a posture from the ends of the joints' ranges, in rad."""
 _SWIVELS = np.concatenate([sign * np.arange(0.1, 3.15, 0.1) for sign in (1.0, -1.0)])
-"""Azimuths of the wrist relative to the hand's that are tried if the vertical plane fails, in rad.
+"""The swivels, defined in `ArmPostures`, that are tried if the vertical plane fails, in rad.
 """
 _CHECKED = 12
-"""Number of points of a way that are checked for collisions."""
+"""Number of points of a path that are checked for collisions."""
 _JUMP = 1.5
 """Largest change of a joint on a straight line up or down, in rad."""
 _PLANAR = 1e-6
-"""Below this swivel the arm counts as in the vertical plane, in rad."""
+"""If the swivel is smaller than this, in rad, the arm counts as in the vertical plane."""
 
 
 @dataclass(frozen=True)
@@ -43,24 +43,25 @@ class HandStop:
     y: float
     yaw: float
     low: float
-    """Lowest height of the fingertips, in m; likewise `high`."""
+    """Lowest height of the fingertips, in m; `high` is the highest."""
     high: float
     surface: float
-    """Height of the highest surface around, in m."""
+    """Height of the highest surface around the hand, in m."""
 
 
 class ArmPostures:
     """Chooses among the joint positions that bring the hand to a pose.
 
-    The arm stands in the vertical plane through its base and the hand, if it can. Otherwise the
-    wrist stands beside this plane, by the *swivel*: an angle about the hand's vertical axis.
+    If possible, the arm lies in the vertical plane through its base and the hand. Otherwise its
+    wrist lies beside this plane. The *swivel* is the angle of the wrist to the plane, about the
+    hand's vertical axis.
     """
 
     def __init__(self, limits: ArmLimits, base: ArmBase, obstacles: Sequence[Capsule] = ()) -> None:
         """
         Args:
-            limits: of the joints.
-            base: where the arm stands.
+            limits: limits of the joints.
+            base: pose of the arm's base in the world.
             obstacles: fixed bodies that it must not touch, in the world.
         """
         self.limits, self.base, self._obstacles = limits, base, tuple(obstacles)
@@ -70,19 +71,21 @@ class ArmPostures:
         self._acceleration = np.array(limits.acceleration)
 
     def hand_pose(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(4) x, y, z, yaw of the hand in the world, of joint positions (7)."""
+        """(4) x, y, z, yaw of the hand in the world, in m and rad, at joint positions (7)."""
         return np.array(hand_state(q.tolist(), [0.0] * JOINTS, self.base)[:4])
 
     def within(self, q: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """(...) whether joint positions (..., 7) exist and are within the range less the margin."""
+        """(...) whether joint positions (..., 7) are not NaN and at least the margin inside their
+        ranges."""
         with np.errstate(invalid="ignore"):
             return np.asarray(((q >= self._lower) & (q <= self._upper)).all(-1))
 
     def along(self, poses: NDArray[np.float64], near: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(n, 7) joint positions along a way of the hand, NaN where it is out of reach.
+        """(n, 7) joint positions along a path of the hand, NaN where it is out of reach.
 
         Args:
-            poses: (n, 4) close to each other; all with the swivel of `near`.
+            poses: (n, 4) x, y, z, yaw of the hand in the world, close to each other. The swivel
+                stays that of `near`.
             near: (7) joint positions close to those of the first pose.
         """
         x, y, z, yaw = np.moveaxis(self.base.to_base(poses), -1, 0)
@@ -96,7 +99,8 @@ class ArmPostures:
         way = np.empty((len(found), JOINTS))
         for i, solutions in enumerate(found):
             apart = np.abs(solutions - near).max(-1)
-            # A jump to another branch is no way.
+            # If even the nearest solution is far away, it belongs to another branch: mark the pose
+            # as out of reach.
             best = int(np.argmin(np.where(np.isfinite(apart), apart, np.inf)))
             near = way[i] = solutions[best] if apart[best] < 0.5 else np.full(JOINTS, np.nan)
         return way
@@ -109,17 +113,18 @@ class ArmPostures:
     def choose(
         self, stops: Sequence[HandStop], now: NDArray[np.float64]
     ) -> tuple[list[NDArray[np.float64]], str]:
-        """The postures at the high ends of one or more stops, for the whole way from `now` on.
+        """Chooses postures at the high ends of one or more stops, so that the whole motion is
+        short.
 
         The jaws are symmetric: the yaws of all stops may be rotated by pi together.
 
         Args:
-            stops: in the order of the way.
+            stops: the stops, in the order in which the hand visits them.
             now: (7) present joint positions.
 
         Returns:
-            (7) joint positions for each stop, and a sentence that says why the arm cannot do it;
-            empty if it can.
+            (7) joint positions for each stop, and a sentence that says why the arm cannot reach the
+            stops; it is empty if it can.
         """
         options: list[list[tuple[int, NDArray[np.float64]]]] = []
         for swivels in (np.zeros(1), _SWIVELS):
@@ -154,7 +159,7 @@ class ArmPostures:
         best: list[NDArray[np.float64]] = []
         least = math.inf
         for half_turn in (0, 1):
-            # The fastest way to each option of a stop.
+            # The fastest sequence of postures that ends at each option of a stop.
             ways = [(0.0, [now])]
             for found in options:
                 following = []
@@ -173,7 +178,7 @@ class ArmPostures:
         return best
 
     def _time(self, start: NDArray[np.float64], end: NDArray[np.float64]) -> float:
-        """About how long a straight way in joint space takes, in s."""
+        """Approximate time of a straight motion in joint space, in s."""
         way = np.abs(end - start)
         top = np.minimum(self._velocity, np.sqrt(way * self._acceleration))
         return float((way / np.maximum(top, 1e-9) + top / self._acceleration).max())
@@ -181,20 +186,22 @@ class ArmPostures:
     def _options(
         self, stop: HandStop, swivels: NDArray[np.float64]
     ) -> list[tuple[int, NDArray[np.float64]]]:
-        """(half turn of the jaws, joint positions at the high end) of all possible postures."""
+        """All possible postures at a stop, each as (number of half turns of the jaws, joint
+        positions at the high end)."""
         found = [
             (half_turn, way)
             for half_turn in (0, 1)
             for way in self._ways(stop, stop.yaw + half_turn * math.pi, swivels)
             if self.within(way).all() and self._is_continuous(way)
         ]
-        # Usually nothing collides: ask once for all.
+        # Usually nothing collides, so check all postures in one call first.
         if found and self.collision(np.concatenate([way for _, way in found]), stop.surface):
             found = [item for item in found if not self.collision(item[1], stop.surface)]
         return [(turned, way[-1]) for turned, way in found]
 
     def _is_continuous(self, way: NDArray[np.float64]) -> bool:
-        """Whether the arm can move on a straight line from the high to the low end of a way."""
+        """Whether the arm can move its hand on a straight line from the high to the low end of a
+        stop."""
         if not way[:, [2, 4]].any():
             return True
         if np.abs(way[-1] - way[0]).max() > _JUMP:
@@ -210,7 +217,8 @@ class ArmPostures:
     def _ways(
         self, stop: HandStop, yaw: float, swivels: NDArray[np.float64]
     ) -> list[NDArray[np.float64]]:
-        """(k, 7) joint positions from the low to the high end, for each posture, maybe NaN."""
+        """For each posture, (k, 7) joint positions at k heights from the low to the high end.
+        Heights out of reach are NaN."""
         heights = np.linspace(stop.low, stop.high, 5)
         poses = np.array([[stop.x, stop.y, z, yaw] for z in heights])
         x, y, z, yaws = np.moveaxis(self.base.to_base(poses), -1, 0)
@@ -230,7 +238,7 @@ class ArmPostures:
         return ways
 
     def _problem(self, stop: HandStop) -> str:
-        """Why there is no posture at a stop."""
+        """A sentence that says why there is no posture at a stop."""
         where = f"{stop.name} at ({stop.x:.3f}, {stop.y:.3f}) m"
         every = np.concatenate([np.zeros(1), _SWIVELS])
 
@@ -244,7 +252,7 @@ class ArmPostures:
             return f"for {where} the arm would collide with {touched[0]}"
         if found:
             return f"{where} is where the arm cannot lower its hand straight"
-        # The yaw matters to joint 7 only.
+        # The yaw affects joint 7 only.
         if reached(*np.linspace(0.0, math.pi, 5)[:-1].tolist()):
             return f"{where} would take joint 7 out of its range"
         heights = f"between {stop.low:.3f} and {stop.high:.3f} m"

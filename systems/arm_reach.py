@@ -1,4 +1,4 @@
-"""Whether a Franka arm can do an action, said before anything moves."""
+"""Checks whether a Franka arm can execute an action before anything moves."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import PlanarPose
 
 _ROOM_ABOVE = 0.03
-"""How far above the clear height an arm can reach, too, for ways with rounded corners, in m."""
+"""How far above the clear height the arm must also reach, in m: motions with rounded corners rise
+above it."""
 
 
 def hand_stops(
@@ -23,14 +24,14 @@ def hand_stops(
     table: float,
     parameters: PickPlaceParameters,
 ) -> list[HandStop]:
-    """Where the hand goes down in an action.
+    """The places at which the hand goes down in an action.
 
     Args:
         pick: pose of the hand at the pick.
-        place: likewise at the place; None to press.
-        heights: of the motion.
+        place: pose of the hand at the place; None if the action is a press.
+        heights: heights of the motion.
         table: height of the table, in m.
-        parameters: of the motion primitive.
+        parameters: parameters of the motion primitive.
     """
     floor = table + parameters.floor_clearance
     highest = heights.clear - parameters.travel_clearance
@@ -49,11 +50,13 @@ def reach_problem(
     stops: Sequence[HandStop],
     now: NDArray[np.float64] | None = None,
 ) -> str:
-    """Why an arm cannot bring its hand to the stops of an action; empty if it can.
+    """A sentence that says why an arm cannot bring its hand to the stops of an action; empty if it
+    can.
 
     Args:
-        postures: of the arm.
-        stops: as `hand_stops` returns them; the jaws' half turns of all of them belong together.
+        postures: chooses the arm's postures.
+        stops: the stops of `hand_stops`. If the jaws are turned by half a turn at one stop, they
+            are turned at all.
         now: (7) present joint positions; None: the middle of their ranges.
     """
     if now is None:

@@ -1,4 +1,5 @@
-"""Where a Franka arm's hand, pointing down, can be: by the joints' ranges alone."""
+"""Maps where the hand of a Franka arm can be while it points down. Only the joints' ranges
+count."""
 
 from __future__ import annotations
 
@@ -11,11 +12,12 @@ from systems.arm_kinematics import ArmBase, inverse, joint_seven, planar
 from systems.arm_limits import ArmLimits
 
 MARGIN = 0.1
-"""How far postures keep from the ends of the joints' ranges, in rad."""
+"""Least distance of a posture from the ends of the joints' ranges, in rad."""
 YAWS = 12
-"""Number of yaws that are tried, from 0 to pi: the jaws are symmetric."""
+"""Number of yaws that are tried. They cover half a turn, because the jaws are symmetric."""
 _SWIVELS = np.arange(-31, 32) / 10
-"""Azimuths of the wrist relative to the hand's, in rad. See `systems.arm_postures`."""
+"""The swivels that are tried, in rad: angles of the wrist to the vertical plane through base and
+hand, as in `systems.arm_postures`."""
 _STEP = 0.005
 """Distance between the radii whose postures are computed, in m."""
 _FARTHEST = 1.0
@@ -25,9 +27,9 @@ _CHUNK = 256
 class ReachMap:
     """The reach of an arm at some heights, for any base.
 
-    Joints 2 to 6 depend on the hand's distance from the base's axis, its height, and the wrist's
-    azimuth; the azimuth of the hand adds to joint 1, and its yaw to joint 7. So the postures are
-    computed once, for each distance.
+    Joints 2 to 6 depend only on the hand's distance from the base's axis, its height, and the
+    swivel. The azimuth of the hand adds to joint 1, and its yaw to joint 7. So the postures are
+    computed only once for each distance.
 
     Collisions are not considered. A distance is rounded to 5 mm.
     """
@@ -35,8 +37,8 @@ class ReachMap:
     def __init__(self, limits: ArmLimits, heights: NDArray[np.float64]) -> None:
         """
         Args:
-            limits: of the joints.
-            heights: (m) of the fingertips above the base, in m.
+            limits: limits of the joints.
+            heights: (m) heights of the fingertips above the base, in m.
         """
         self._lower = np.array(limits.lower) + MARGIN
         self._upper = np.array(limits.upper) - MARGIN
@@ -49,12 +51,13 @@ class ReachMap:
         self._first = np.concatenate([first for _, first in parts]).reshape(shape)
 
     def _postures(self, tips: NDArray[np.float64]) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-        """(n, swivels, 8) whether joints 2 to 6 are inside their ranges, and joint 1 in rad."""
+        """(n, swivels, 8) whether joints 2 to 6 are inside their ranges, and (n, swivels, 8)
+        positions of joint 1 in rad."""
         zero = np.zeros((len(tips), len(_SWIVELS)))
         q7 = np.broadcast_to(joint_seven(_SWIVELS, 0.0), zero.shape)
         points = np.broadcast_to(tips[:, None, :], (*zero.shape, 3))
         found = inverse(points, q7, zero)
-        # There the general solution is singular.
+        # At a swivel of zero the general solution is singular.
         middle = len(_SWIVELS) // 2
         found[:, middle] = planar(tips, q7[:, middle])[:, None, :]
         with np.errstate(invalid="ignore"):
@@ -62,11 +65,11 @@ class ReachMap:
         return np.asarray(inside[..., 1:6].all(-1)), found[..., 0]
 
     def shares(self, base: ArmBase, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(n, m) the share of all yaws at which the hand can be at points, at each height.
+        """(n, m) for each point and height, the share of all yaws at which the hand can be there.
 
         Args:
-            base: of the arm; its height does not matter.
-            points: (n, 2) x and y in the world, in m.
+            base: pose of the arm's base in the world; its height is not used.
+            points: (n, 2) x and y of the points in the world, in m.
         """
         placed = base.to_base_points(np.column_stack([points, np.full(len(points), base.z)]))
         radius = np.hypot(placed[:, 0], placed[:, 1])
@@ -90,7 +93,7 @@ class ReachMap:
         other = _wrapped(q7 + math.pi)
         low, high = self._lower[6], self._upper[6]
         turns = ((q7 >= low) & (q7 <= high)) | ((other >= low) & (other <= high))
-        # (n, heights, swivels) times (n, swivels, yaws).
+        # Matrix product of (n, heights, swivels) and (n, swivels, yaws).
         return np.asarray((stands.astype(np.float32) @ turns.astype(np.float32) > 0).mean(-1))
 
 

@@ -1,4 +1,4 @@
-"""The fastest stop of a Franka arm."""
+"""Plans the fastest stop of a Franka arm."""
 
 from __future__ import annotations
 
@@ -15,15 +15,17 @@ from systems.arm_limits import JOINTS, ArmLimits
 _SHARE = 0.98
 """Share of the limits of acceleration and jerk that a stop uses."""
 _TRIES = 4
-"""How often a stop is tried until the rates of the torques are within their limits."""
+"""How many jerk limits are tried at most, until the rates of the torques are within their
+limits."""
 _RESTS = 1e-9
-"""Below this velocity and acceleration the arm rests, in SI units."""
+"""Below this velocity in rad/s and this acceleration in rad/s^2 the arm counts as at rest."""
 
 
 class ArmStop:
-    """Brings all joints to rest, in the direction in which they move; by Ruckig.
+    """Brings all joints to rest with Ruckig. The joints brake along the direction in which they
+    move.
 
-    The jerk is constant between a few points in time.
+    The jerk is piecewise constant.
     """
 
     def __init__(
@@ -36,12 +38,15 @@ class ArmStop:
     ) -> None:
         """
         Args:
-            q: (7) joint positions at the beginning. Likewise velocities `v`, accelerations `a`.
-            limits: of the joints; only those of acceleration, jerk and torque rate matter.
-            inertia: of the arm; None: the rates of the torques are not limited.
+            q: (7) joint positions at the beginning, in rad.
+            v: (7) joint velocities at the beginning, in rad/s.
+            a: (7) joint accelerations at the beginning, in rad/s^2.
+            limits: limits of the joints; only those of acceleration, jerk and torque rate are used.
+            inertia: model of the arm's inertia; None: the rates of the torques are not limited.
         """
         self.goal, self.duration = q, 0.0
-        """(7) where the joints come to rest, after how many seconds."""
+        """The positions (7), in rad, in which the joints come to rest, and how long that takes, in
+        s."""
         if np.abs(v).max() < _RESTS and np.abs(a).max() < _RESTS:
             return
         jerk = _SHARE * np.array(limits.jerk)
@@ -55,11 +60,12 @@ class ArmStop:
             jerk = np.maximum(jerk / (1.02 * excess), 1.0)
 
     def _jerks(self) -> NDArray[np.float64]:
-        """(n, 7) between the switches."""
+        """(n, 7) the constant jerk of each piece of the motion, in rad/s^3."""
         return np.asarray(np.diff(self._states[:, 2], axis=0) / np.diff(self._times)[:, None])
 
     def _tabulate(self, found: ruckig.Trajectory) -> None:
-        # Keep numbers only: Ruckig's own objects complain when they outlive the interpreter.
+        # Keep only plain numbers: Ruckig's objects report errors if they still exist when Python
+        # exits.
         self.duration = found.duration
         switches = {0.0, found.duration}
         for profile in found.profiles[0]:
@@ -72,7 +78,8 @@ class ArmStop:
         self.goal = self._states[-1, 0].copy()
 
     def at(self, time: float) -> NDArray[np.float64]:
-        """(21) joint positions, velocities and accelerations, before the end."""
+        """(21) joint positions, velocities and accelerations at a time since the beginning, in s,
+        which must be before the end."""
         index = min(max(bisect.bisect_right(self._times, time) - 1, 0), len(self._times) - 2)
         h, lasts = time - self._times[index], self._times[index + 1] - self._times[index]
         q, v, a = self._states[index]

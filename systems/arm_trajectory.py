@@ -1,4 +1,4 @@
-"""The joint trajectory of a whole pick and place of a Franka arm, planned before it moves."""
+"""Plans the joint trajectory of a whole pick and place of a Franka arm before it moves."""
 
 from __future__ import annotations
 
@@ -16,47 +16,48 @@ from systems.pick_place_parameters import Mode, PickPlaceParameters
 from systems.signals import PickPlaceAction, SurfaceHeights
 
 FASTEST_RATE, SLOWEST_RATE = 1000, 200
-"""Highest and lowest rate of a trajectory, in Hz. Franka's controller runs at 1 kHz. At lower rates
-the motion that a controller interpolates would break the limits of acceleration by some percent."""
+"""Highest and lowest rate of a trajectory, in Hz. Franka's controller runs at 1 kHz. Below 200 Hz
+the interpolated motion would exceed the limits of acceleration by a few percent."""
 _ROUNDOFF = 1e-6
 
 
 @dataclass(frozen=True)
 class Segment:
-    """One mode of the planner."""
+    """The part of a trajectory that belongs to one mode of the planner."""
 
     mode: str
-    """Its name, such as `APPROACH`."""
+    """Name of the mode, such as `APPROACH`."""
     first: int
-    """Index of its first point. The last point of a segment is the first point of the next one."""
+    """Index of the segment's first point. The last point of a segment is the first point of the
+    next one."""
     last: int
     stop_force: float | None = None
-    """The arm should stop when the vertical contact force on the hand exceeds this, in N; None: it
-    expects no contact."""
+    """The vertical contact force on the hand, in N, above which the arm should stop; None if no
+    contact is expected."""
 
 
 @dataclass(frozen=True)
 class JawCommand:
-    """A command to the jaws, as the Franka Hand takes it."""
+    """A command to the jaws, with the arguments of the Franka Hand's `move` and `grasp`."""
 
     time: float
-    """Since the start of the trajectory, in s."""
+    """Time of the command since the start of the trajectory, in s."""
     width: float
-    """Goal of the opening between the pads, in m."""
+    """Commanded opening between the pads, in m."""
     speed: float
-    """Of the opening, in m/s."""
+    """Rate at which the opening changes, in m/s."""
     force: float = 0.0
-    """Force with which to hold an object, in N; zero: only move."""
+    """Force with which the jaws hold an object, in N; zero if they only move."""
 
 
 @dataclass(frozen=True)
 class ArmTrajectory:
-    """Joint positions at a constant rate, from rest to rest."""
+    """Joint positions, velocities and accelerations at a constant rate, from rest to rest."""
 
     rate: float
-    """Points in a second."""
+    """Rate of the points, in Hz."""
     positions: NDArray[np.float64]
-    """(n, 7) in rad. Likewise velocities, in rad/s, and accelerations, in rad/s^2."""
+    """(n, 7) joint positions, in rad. `velocities` are in rad/s, `accelerations` in rad/s^2."""
     velocities: NDArray[np.float64]
     accelerations: NDArray[np.float64]
     segments: tuple[Segment, ...] = ()
@@ -64,23 +65,25 @@ class ArmTrajectory:
     start_width: float = 0.08
     """Opening between the pads at the start, in m."""
     limits_used: tuple[tuple[str, float], ...] = ()
-    """The largest share of each kind of limit that the motion uses, up to 1. Positions count from
-    the middle of a joint's range."""
+    """For each kind of limit, its name and the largest share of it that the motion uses, up to 1.
+    For positions the share is the distance from the middle of a joint's range, divided by half the
+    range."""
 
     @property
     def times(self) -> NDArray[np.float64]:
-        """(n) since the start, in s."""
+        """(n) times of the points since the start, in s."""
         return np.arange(len(self.positions)) / self.rate
 
     @property
     def duration(self) -> float:
-        """In s."""
+        """Duration of the trajectory, in s."""
         return (len(self.positions) - 1) / self.rate
 
     def at(self, time: float) -> NDArray[np.float64]:
-        """(21) positions, velocities and accelerations; at rest before the start and after the end.
+        """(21) joint positions, velocities and accelerations at a time since the start, in s. The
+        arm is at rest before the start and after the end.
 
-        Between the points positions follow polynomials of degree 5 that fit position, velocity and
+        Between the points, positions follow polynomials of degree 5 that fit position, velocity and
         acceleration at both ends, as in ROS's `joint_trajectory_controller`.
         """
         if not 0.0 <= time < self.duration:
@@ -93,7 +96,7 @@ class ArmTrajectory:
         return quintic(q, v, a, step=1 / self.rate, since=time - index / self.rate)
 
     def width_at(self, time: float) -> tuple[float, float]:
-        """The opening between free jaws in m, and its rate in m/s."""
+        """The opening of the jaws in m, if they hold nothing, and its rate in m/s."""
         width, rate, since = self.start_width, 0.0, 0.0
         goal, speed = width, 0.0
         for command in (*self.jaws, None):
@@ -123,14 +126,17 @@ def quintic(
     step: float,
     since: float,
 ) -> NDArray[np.float64]:
-    """(3 k) values and two derivatives of polynomials of degree 5 through two points.
+    """(3 k) values, first and second derivatives of k polynomials of degree 5 through two points.
 
     Args:
-        q: (2, k) values at the points. Likewise first and second derivatives `v` and `a`.
-        step: between the points.
-        since: the first point.
+        q: (2, k) values at the two points.
+        v: (2, k) first derivatives at the two points.
+        a: (2, k) second derivatives at the two points.
+        step: time between the points, in s.
+        since: time since the first point at which to evaluate, in s.
     """
-    # The residuals beyond the first point's parabola, in powers of the share of the step.
+    # Subtract the parabola of the first point; the rest is a polynomial in since / step with powers
+    # 3 to 5.
     h = step
     first = q[1] - q[0] - h * v[0] - h * h / 2 * a[0]
     second = h * (v[1] - v[0] - h * a[0])
@@ -159,19 +165,20 @@ def plan_action(
 ) -> ArmTrajectory | str:
     """Plans the joint trajectory of an action, as the planner would execute it.
 
-    Nothing is felt in advance. The arm descends to the grasp height, the jaws may take the time to
-    close and to open fully, and the held object is lowered to its place as o_t shows it.
+    Contacts are not known in advance. So the arm descends to the grasp height, the jaws get the
+    time to close and to open fully, and the held object is lowered to the surface that o_t shows at
+    its place.
 
     Args:
-        motion: of the arm.
-        parameters: the motion's.
+        motion: plans the arm's motions.
+        parameters: the parameters of `motion`.
         action: a pick and place, or a press.
-        surfaces: heights around pick and place.
+        surfaces: heights of the surfaces around pick and place.
         joints: (7) where the arm starts, at rest; None: `motion.home_joints`.
-        rate: points in a second, from `SLOWEST_RATE` to `FASTEST_RATE`.
+        rate: rate of the points, in Hz, from `SLOWEST_RATE` to `FASTEST_RATE`.
 
     Returns:
-        The trajectory, or a sentence that says why the arm cannot do it.
+        The trajectory, or a sentence that says why the arm cannot execute the action.
     """
     state = motion.view(motion.initial_state())
     if joints is not None:
@@ -213,14 +220,14 @@ def limits_used(
 
     Args:
         samples: (n, 21) positions, velocities and accelerations at a constant rate.
-        limits: of the joints; the velocities' may depend on the positions.
-        rate: samples in a second. At rates below 1 kHz the jerk is underestimated.
+        limits: limits of the joints; those of the velocities may depend on the positions.
+        rate: rate of the samples, in Hz. At rates below 1 kHz the jerk is underestimated.
     """
     q, v, a = np.split(samples, 3, axis=1)
     lower, upper = np.array(limits.lower), np.array(limits.upper)
     position = np.abs(2 * (q - lower) / (upper - lower) - 1)
     low, high = limits.velocity_bounds(q)
-    # Where a joint must not move at all, a velocity of zero uses nothing.
+    # Avoid 0 / 0 at the end of a joint's range, where the limit of velocity is zero.
     velocity = np.where(v > 0, v, -v) / np.maximum(np.where(v > 0, high, -low), 1e-9)
     jerk = np.abs(np.diff(a, axis=0)) * rate / limits.jerk
     shares = {
@@ -269,7 +276,7 @@ class _Recorder:
         self.jaws: list[JawCommand] = []
 
     def record(self) -> None:
-        """All modes, from `APPROACH` to the end of `RETREAT`."""
+        """Records all modes, from `APPROACH` to the end of `RETREAT`."""
         state, parameters = self._state, self._parameters
         contact = parameters.contact_threshold
         self._mode(Mode.APPROACH)
@@ -289,21 +296,22 @@ class _Recorder:
         self.samples.append(self._motion.motion_at(state, self._point / self._rate))
 
     def _mode(self, mode: Mode, settle: float = 0.0, stop_force: float | None = None) -> None:
-        """Begins a mode, and samples it until it has arrived and rested for `settle`."""
+        """Begins a mode, and samples it until it has arrived and then rested for `settle`
+        seconds."""
         state, motion, first = self._state, self._motion, self._point
         begun = first / self._rate
         motion.begin(state, mode, begun)
         lowest = state.table_z + self._parameters.floor_clearance
         if mode == Mode.LOWER:
-            # Not to the table, but to the place as o_t shows it.
+            # Lower the object to the surface that o_t shows at the place, not to the table.
             hanging = max(state.grasp_z - state.support_z, 0.0)
             motion.back_off(state, max(state.floor_z + hanging - lowest, 0.0))
         elif mode == Mode.DESCEND and state.press:
-            # Not into the table, if nothing stops the hand.
+            # No contact stops the hand here, so keep its goal above the table.
             goal = state.pick_top_z - self._parameters.press_depth
             motion.back_off(state, max(lowest - goal, 0.0))
         elif mode == Mode.RELEASE:
-            # The object's width is unknown.
+            # The object's width is unknown, so open the jaws fully.
             state.goal_opening = self._parameters.open_width
         self._command_jaws(mode, begun)
         while not self._is_over(mode, settle):

@@ -1,4 +1,5 @@
-"""One way of a Franka arm: a stop, then a motion along a path."""
+"""One motion, here called a way, of a Franka arm: it first brakes to a stop, then follows a
+path."""
 
 from __future__ import annotations
 
@@ -17,59 +18,69 @@ from systems.path_timing import TICK, RowLimits, SmoothMotion, plan_motion
 from systems.vector_view import Array, Number, VectorView
 
 _LINE_POINTS = 17
-"""Points of a straight line of the hand whose joint positions are computed."""
+"""Number of points of a straight line of the hand at which the joint positions are computed."""
 _SPACING = 0.010
-"""Distance of a path's points, as the time that the fastest joint needs at full speed, in s."""
+"""Spacing of a path's points, in s: the time that the slowest joint takes from one to the next at
+full speed."""
 _ROUNDING, _WIDER = 0.15, 0.3
-"""Length of the path over which corners are rounded, likewise: two of them, and a single one."""
+"""Length of the path over which corners are rounded, in the same measure as `_SPACING`: if the path
+has two corners, and if it has one."""
 _FEWEST, _MOST = 40, 200
 _ANY_ACCELERATION = 1e3
-"""Of the yaw of a straight line, in rad/s^2: the joints' limits hold anyway."""
+"""Acceleration of the yaw on a straight line, in rad/s^2. It is so large that only the joints'
+limits matter."""
 _NEARLY_THERE = 0.02
 """Within this horizontal distance of its end the hand may sink below the clear height, in m."""
 _STRAIGHT_UP = 0.006
 """Within this horizontal distance of its start the hand may still rise, in m."""
 _INSTANT = 1e-9
 _COARSE = 16
-"""One of so many samples is looked at for collisions."""
+"""Every 16th sample is checked for collisions."""
 _STRIDE = 4 * TICK
 """Time between the stored accelerations of the fingertips, in s."""
 
 
 class WayVector(VectorView):
-    """All that a way depends on, in SI units. What is absent is NaN."""
+    """All numbers that define a motion, in SI units. Fields that do not apply are NaN.
+
+    The motion follows either a straight line of the hand (`line`), or a path that rises, crosses at
+    a safe height and sinks (`over`)."""
 
     start = Array(3 * JOINTS)
-    """Joint positions, velocities and accelerations at the beginning."""
+    """Joint positions, velocities and accelerations at the beginning of the motion."""
     line = Array(4)
     """Goal of a straight line of the hand: x, y, z, yaw in the world."""
     marks = Array(2)
-    """Heights below which the line slows down, and slows down further."""
+    """Two heights: below the first the hand slows down on the line, below the second it slows down
+    again."""
     speeds = Array(3)
     """Speeds of the line: above, between and below the marks."""
     yaw_speed = Number()
-    """Of the line."""
+    """Rate of the yaw on the line."""
     over = Array(JOINTS)
-    """Goal of a way across: joint positions at the clear height, or at the goal if it is higher."""
+    """Goal of a path that crosses: joint positions at the clear height, or at the goal if that is
+    higher."""
     clear = Number()
     """Height of the fingertips above which the hand may travel."""
     sink = Number()
-    """Height to which the hand sinks at the end of a way across."""
+    """Height to which the hand sinks at the end of a path that crosses."""
     speed = Number()
-    """Highest linear speed of a way across. Likewise `acceleration`, of all ways."""
+    """Highest linear speed of the hand on a path that crosses. `acceleration` is the highest linear
+    acceleration on any path."""
     acceleration = Number()
 
 
 @dataclass(frozen=True)
 class _Path:
-    """(n, 7) evenly spaced points, and the fingertips there in the world, (n, 3)."""
+    """Evenly spaced joint positions (n, 7), and the fingertips' positions there in the world,
+    (n, 3)."""
 
     points: NDArray[np.float64]
     tips: NDArray[np.float64]
 
 
 class ArmWay:
-    """A way as a function of the time since its beginning."""
+    """One motion of the arm as a function of the time since its beginning."""
 
     def __init__(
         self,
@@ -80,8 +91,8 @@ class ArmWay:
         """
         Args:
             vector: a `WayVector`.
-            postures: of the arm.
-            inertia: of the arm; None: the rates of the torques are not limited.
+            postures: chooses the arm's postures.
+            inertia: model of the arm's inertia; None: the rates of the torques are not limited.
         """
         self._inertia = inertia
         self._postures, self._limits = postures, postures.limits
@@ -94,7 +105,8 @@ class ArmWay:
         self._accelerations = self._hand_accelerations()
 
     def at(self, time: float) -> NDArray[np.float64]:
-        """(21) joint positions, velocities and accelerations."""
+        """(21) joint positions, velocities and accelerations at a time since the beginning, in
+        s."""
         if time >= self.duration - _INSTANT:
             goal = self._motion.goal if self._motion else self._rest
             return np.concatenate([goal, np.zeros(2 * JOINTS)])
@@ -104,7 +116,7 @@ class ArmWay:
         return self._motion.at(time - self._stopping)
 
     def positions(self) -> NDArray[np.float64]:
-        """(n, 7) joint positions along the way."""
+        """(n, 7) joint positions along the motion."""
         if self._motion is None:
             return self._rest[None]
         return self._motion.samples[::_COARSE, :JOINTS]
@@ -115,7 +127,8 @@ class ArmWay:
         return self._accelerations[index]
 
     def _hand_accelerations(self) -> NDArray[np.float64]:
-        """(n, 3) accelerations of the fingertips at every stride."""
+        """(n, 3) accelerations of the fingertips in the world, in m/s^2, at intervals of
+        `_STRIDE`."""
         count = math.ceil(self.duration / _STRIDE) + 2
         q = np.empty((count, JOINTS))
         stopping = min(math.ceil(self._stopping / _STRIDE), count)
@@ -123,7 +136,7 @@ class ArmWay:
             q[i] = self._stop.at(i * _STRIDE)[:JOINTS]
         q[stopping:] = self._rest
         if self._motion is not None:
-            # Whole ticks, so that the samples are evenly spaced.
+            # Round to whole ticks, so that the samples are evenly spaced.
             first = round((stopping * _STRIDE - self._stopping) / TICK)
             index = first + round(_STRIDE / TICK) * np.arange(count - stopping)
             q[stopping:] = self._motion.samples[
@@ -159,7 +172,8 @@ class ArmWay:
     def _line(
         self, q: NDArray[np.float64], goal: NDArray[np.float64], points: int = _LINE_POINTS
     ) -> NDArray[np.float64]:
-        """(n, 7) joint positions on a straight line of the hand, as far as it can be reached."""
+        """(n, 7) joint positions on a straight line of the hand, up to the first point out of
+        reach."""
         start = self._postures.hand_pose(q)
         way = goal - start
         way[3] = np.remainder(way[3] + np.pi, 2 * np.pi) - np.pi
@@ -167,7 +181,7 @@ class ArmWay:
         line = self._postures.along(start + share * way, q)
         if not np.isfinite(line[0]).all():
             return q[None]
-        # After a stop the hand may not point down exactly: correct this on the way.
+        # After a stop the hand may be slightly tilted. Correct this gradually along the line.
         line += (1 - share) * (q - line[0])
         inside = self._postures.within(line)
         beyond = np.flatnonzero(~inside)
@@ -181,7 +195,7 @@ class ArmWay:
         poses = np.array([self._postures.hand_pose(point) for point in path.points])
         yaw = np.unwrap(poses[:, 3])
         fast, middle, slow = way.speeds.tolist()
-        # A point is as slow as its lower neighbour.
+        # The speed at a point is that of its lower neighbour.
         below = np.minimum(poses[:, 2], np.append(poses[1:, 2], poses[-1, 2]))
         limit = np.where(below < way.marks[1], slow, np.where(below < way.marks[0], middle, fast))
         high = np.column_stack([np.repeat(limit[:, None], 3, 1), np.full(len(yaw), way.yaw_speed)])
@@ -189,10 +203,11 @@ class ArmWay:
         acceleration = np.array([*[way.acceleration] * 3, _ANY_ACCELERATION])
         return self._timed(path.points, rows, high, acceleration)
 
-    # Ways across.
+    # Paths that cross at a safe height.
 
     def _across(self, way: WayVector, q: NDArray[np.float64]) -> _Path:
-        """Up above the clear height, straight in joint space, and down near the goal."""
+        """A path that rises above the clear height, crosses straight in joint space, and sinks near
+        the goal."""
         over = way.over
         end = self._postures.hand_pose(over)
         single = self._postures.hand_pose(q)[2] >= way.clear or way.sink >= way.clear
@@ -210,7 +225,7 @@ class ArmWay:
                 return path
             raised += missing + 0.005
         if path is None:
-            # Nothing to do: stay.
+            # The path has no length, so stay.
             points = np.repeat(q[None], 3, axis=0)
             return _Path(points, self._postures.base.to_world(fingertips(points)))
         return path
@@ -232,7 +247,8 @@ class ArmWay:
         return below if len(below) > 1 else above[-1:]
 
     def _missing(self, path: _Path, clear: float) -> float:
-        """How much too low the hand is between start and end, in m."""
+        """How far the hand sinks below the clear height between start and end, in m; not positive
+        if it stays above."""
         tips = path.tips
         away = np.linalg.norm(tips[:, :2] - tips[0, :2], axis=1) > _STRAIGHT_UP
         before = np.linalg.norm(tips[:, :2] - tips[-1, :2], axis=1) > _NEARLY_THERE
@@ -240,7 +256,8 @@ class ArmWay:
         return float(clear - crossing.min()) if len(crossing) else 0.0
 
     def _evenly(self, corners: NDArray[np.float64], rounding: float) -> _Path | None:
-        """The path through points, with rounded corners; None if it has no length."""
+        """An evenly spaced path through the corners, which are rounded; None if it has no
+        length."""
         steps = np.abs(np.diff(corners, axis=0)) / self._limits.velocity
         along = np.concatenate([[0.0], np.cumsum(steps.max(axis=1, initial=0.0))])
         if along[-1] < 1e-7:
@@ -255,7 +272,8 @@ class ArmWay:
 
 
 def _averaged(points: NDArray[np.float64], half: int) -> NDArray[np.float64]:
-    """Each point as mean over itself and `half` neighbours at each side; the ends stay."""
+    """Replaces each point by the mean of itself and `half` neighbours on each side. The two ends
+    stay."""
     half = min(half, len(points) - 1)
     before = 2 * points[0] - points[half:0:-1]
     after = 2 * points[-1] - points[-2 : -half - 2 : -1]

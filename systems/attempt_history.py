@@ -1,5 +1,5 @@
-"""The planner's memory as vectors of discrete state: its earlier actions, and a stopping policy's
-report."""
+"""Stores the planner's earlier actions, and the report of a policy that has stopped, in vectors of
+discrete state."""
 
 from __future__ import annotations
 
@@ -14,28 +14,30 @@ MOST_ATTEMPTS = 64
 MOST_FAILED = 16
 """How many failed picks are remembered."""
 _SAME_OBJECT = 0.040
-"""A centre of mass this close to a pick is taken for that of the same object, in metres."""
+"""If a measured centre of mass and a pick are closer than this, they are taken for the same
+object's, in metres."""
 MOST_LEFT_OVER = 24
-"""How many objects, and how many cavities, of a `LeftOver` are kept."""
+"""At most this many objects, and as many cavities, of a `LeftOver` are kept."""
 
 
 class _Row(VectorView):
-    """One attempt. A row of NaN is free."""
+    """The vector's part that holds one attempt; all NaN if it is unused."""
 
     pick = Array(3)
-    """x, y, theta."""
+    """Pick pose in the world: x and y in m, theta in rad."""
     place = Array(3)
     press = Number()
     aside = Number()
     outcome = Number()
-    """An index in `OUTCOMES`."""
+    """Index of the outcome in `OUTCOMES`."""
     peak_force = Number()
     balance = Array(2)
-    """x, y; NaN if there is none."""
+    """Measured centre of mass of the object, x and y in the world in m; NaN if it was not
+    measured."""
 
 
 class AttemptHistory:
-    """The last `MOST_ATTEMPTS` actions, in a vector that the caller owns."""
+    """Keeps the last `MOST_ATTEMPTS` actions in a vector that the caller owns."""
 
     size = MOST_ATTEMPTS * _Row.size
     """Number of elements of the vector."""
@@ -54,7 +56,7 @@ class AttemptHistory:
         peak_force: float,
         balance: tuple[float, float] | None = None,
     ) -> None:
-        """Adds an attempt; the oldest one is forgotten if there is no room."""
+        """Adds an attempt. If there is no room, the oldest one is dropped."""
         count = self._count()
         if count == MOST_ATTEMPTS:
             self._rows[:-1] = self._rows[1:].copy()
@@ -85,12 +87,13 @@ class AttemptHistory:
         return tuple(found)
 
     def failed_picks(self) -> tuple[PlanarPose, ...]:
-        """The last `MOST_FAILED` picks of actions that did not place their object, latest last."""
+        """The last `MOST_FAILED` picks whose actions did not place their object, oldest first."""
         failed = [item.action.pick for item in self.attempts() if item.outcome != "placed"]
         return tuple(failed[-MOST_FAILED:])
 
     def set_downs(self, pick: PlanarPose) -> int:
-        """How many attempts have felt a centre of mass near a pick."""
+        """How many attempts have measured a centre of mass near a pick, and so set an object down
+        again."""
         felt = self._rows[: self._count(), -2:]
         away = np.linalg.norm(felt - (pick.x, pick.y), axis=1)
         return int(np.count_nonzero(away < _SAME_OBJECT))
@@ -100,11 +103,11 @@ class AttemptHistory:
 
 
 class LeftOverVector:
-    """A `LeftOver`, or None, in a vector that the caller owns."""
+    """Keeps a `LeftOver`, or None, in a vector that the caller owns."""
 
     size = 1 + 4 * MOST_LEFT_OVER
-    """Number of elements of the vector: whether there is one, then x and y of each object and each
-    cavity; NaN after the last."""
+    """Number of elements of the vector: first 1 if there is a `LeftOver`, else 0; then x and y of
+    each object and of each cavity, and NaN for unused elements."""
 
     def __init__(self, vector: NDArray[np.float64]) -> None:
         """
@@ -126,7 +129,7 @@ class LeftOverVector:
             kept[: len(given)] = given
 
     def read(self) -> LeftOver | None:
-        """What was written."""
+        """The `LeftOver` that was written last; None if there is none."""
         if not self._vector[0]:
             return None
         objects, cavities = (

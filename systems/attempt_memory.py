@@ -1,4 +1,4 @@
-"""The oracle's memory: which object was picked how often, and by which of its grasps."""
+"""Counts how often the oracle has picked each object, and with which of the object's grasps."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ class AttemptMemory:
 
     It adds two optional input ports to the system:
 
-    - `mode` (1): the `PickPlacePlanner`'s; an action begins with `APPROACH`.
-    - `accepted_action` (abstract, `PickPlaceAction`): the planner's, the last action begun.
+    - `mode` (1): mode of the `PickPlacePlanner`; an action begins with `APPROACH`.
+    - `accepted_action` (abstract, `PickPlaceAction`): the action that the planner began last.
 
-    The object is the one whose grasp is nearest to the pick when the action begins. If the ports
-    are not connected, nothing is counted.
+    An attempt counts for the object whose grasp is nearest to the pick when the action begins. If
+    the ports are not connected, nothing is counted.
     """
 
     def __init__(
@@ -42,10 +42,10 @@ class AttemptMemory:
     ) -> None:
         """
         Args:
-            system: the oracle; gets two ports, a state and a periodic event.
-            objects: n of them.
-            grasps: n, the grasps of each object.
-            body_poses: the oracle's port of that name.
+            system: the oracle, to which two ports, a state and a periodic event are added.
+            objects: the n objects.
+            grasps: for each of the n objects, its grasps.
+            body_poses: the oracle's input port `body_poses`.
         """
         self._objects, self._grasps, self._body_poses = objects, grasps, body_poses
         self._most = max((len(choices) for choices in grasps), default=0)
@@ -53,14 +53,15 @@ class AttemptMemory:
         self._accepted = system.DeclareAbstractInputPort(
             "accepted_action", Value(PickPlaceAction())
         )
-        # The last mode, then n rows of attempts.
+        # The planner's last mode, then one row of counts for each object.
         self._index = system.DeclareDiscreteState(np.zeros(1 + len(objects) * self._most))
         self.ticket = system.discrete_state_ticket(self._index)
-        """The ticket of outputs that depend on `attempts`."""
+        """Dependency ticket for outputs that depend on `attempts`."""
         system.DeclarePeriodicDiscreteUpdateEvent(_PERIOD, 0.0, self._update)
 
     def attempts(self, context: Context) -> NDArray[np.float64]:
-        """(n, g): how often each grasp of each object was tried; g is the most grasps of any."""
+        """(n, g) how often each grasp of each object was tried; g is the largest number of grasps
+        of an object."""
         values = context.get_discrete_state(self._index).get_value()
         return values[1:].reshape(len(self._objects), self._most)
 
@@ -88,17 +89,17 @@ class AttemptMemory:
 def nearest_grasp(
     grasps: Sequence[Sequence[Grasp]], poses: Sequence[RigidTransform], pick: PlanarPose
 ) -> tuple[int, int] | None:
-    """The object and the index of its grasp that are nearest to a pick.
+    """Finds the grasp that is nearest to a pick, and the object to which it belongs.
 
-    Grasps at one point differ by their angles.
+    The distance includes the angle, because an object may have several grasps at one point.
 
     Args:
-        grasps: n, the grasps of each object, in B.
-        poses: n, X_WB of each object.
+        grasps: the grasps of each of the n objects, in its body frame B.
+        poses: X_WB of each of the n objects.
         pick: the gripper's pose in the world.
 
     Returns:
-        Both indices; None if no object has a grasp.
+        (index of the object, index of its grasp); None if no object has a grasp.
     """
     best: tuple[float, int, int] | None = None
     for index, (choices, X_WB) in enumerate(zip(grasps, poses, strict=True)):
@@ -106,7 +107,7 @@ def nearest_grasp(
         for number, grasp in enumerate(choices):
             x, y, _ = X_WB @ np.array([grasp.x, grasp.y, 0.0])
             turn = math.remainder(pick.theta - yaw - grasp.theta, math.pi)
-            # A tenth of a radian counts like a millimetre.
+            # An angle of 0.1 rad counts as much as a distance of 1 mm.
             cost = math.hypot(pick.x - x, pick.y - y) + 0.01 * abs(turn)
             if best is None or cost < best[0]:
                 best = cost, index, number

@@ -10,7 +10,8 @@ from typing import Any
 
 
 def bounded(default: Any, minimum: float = -math.inf, maximum: float = math.inf) -> Any:
-    """A dataclass field with a default number, or list of numbers, and its inclusive range.
+    """Declares a dataclass field: a number, or a list of numbers, with a default and an inclusive
+    range.
 
     A list must keep the length of its default.
     """
@@ -21,7 +22,7 @@ def bounded(default: Any, minimum: float = -math.inf, maximum: float = math.inf)
 
 
 def check_bounds(config: Any, where: str = "") -> None:
-    """Checks all numbers of a dataclass, recursively through nested dataclasses, lists and dicts.
+    """Checks all numbers of a dataclass, and of the dataclasses, lists and dicts inside it.
 
     Raises:
         ValueError: a number is not finite or out of its range, or a list has the wrong length. The

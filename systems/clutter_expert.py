@@ -1,4 +1,4 @@
-"""The oracle's next action where objects touch, or lie on each other."""
+"""Chooses the oracle's next action if objects touch each other or lie on each other."""
 
 from __future__ import annotations
 
@@ -19,19 +19,21 @@ from systems.placement import displacement, heading
 from systems.signals import PickPlaceAction, PlanarPose, wrap_to_pi
 
 _NEAR_BEST = 0.035
-"""A grasp further from the best one than this is used only to lay an object aside, in metres."""
+"""A grasp further than this from the object's best grasp, in metres, is used only to lay the object
+aside."""
 _ANY = math.radians(65.0)
-"""The lean of faces that are gripped if no others are left."""
+"""Largest tilt of a gripped face when all flatter grasps have failed, in radians."""
 _IN_CAVITY = 0.03
-"""An object displaced less from its goal lies in or over its cavity, in metres."""
+"""An object displaced less than this from its goal, in metres, lies in or over its cavity."""
 
 
 class ClutterExpert:
     """Chooses actions for one state of the table.
 
-    An object that lies flat, the right way up and under nothing, and that can be gripped near its
-    best grasp, goes to its goal. If there is none, an object under nothing is laid aside on a free
-    part of the table. It then lies flat and free, or is laid aside again.
+    An object goes to its goal if it lies flat and the right way up, has nothing on top of it, and
+    can be gripped near its best grasp. If there is no such object, an object with nothing on top of
+    it is laid aside on a free part of the table. If it does not come to rest flat and free, it is
+    laid aside again.
     """
 
     def __init__(
@@ -44,7 +46,7 @@ class ClutterExpert:
         Args:
             table: the objects and their grasps.
             poses: X_WB of each object.
-            failed: earlier picks in the world that held nothing.
+            failed: gripper poses, in the world, of earlier picks that held nothing.
         """
         self._table, self._poses, self._failed = table, list(poses), failed
         self._points = table.points(poses)
@@ -57,7 +59,7 @@ class ClutterExpert:
         """The action that brings an object to its goal; None if it must be laid aside first.
 
         Args:
-            index: the object.
+            index: index of the object.
             X_WGoal: its goal pose.
             rim: world z of the cavity's rim, in metres.
         """
@@ -75,8 +77,8 @@ class ClutterExpert:
     def aside(self, items: Sequence[int]) -> PickPlaceAction | None:
         """The action that lays one of some objects aside; None if none can be.
 
-        Of the objects under nothing, it takes the one whose grasp is least obstructed, and of these
-        the highest.
+        It prefers objects with nothing on top of them, then the least obstructed grasp, then the
+        highest object.
         """
         choices = [index for index in items if not self._covered[index]] or list(items)
         found = []
@@ -96,8 +98,8 @@ class ClutterExpert:
             in_cavity = displacement(item, X_WGoal, self._poses[index]) < _IN_CAVITY
         arguments = (index, self._poses, self._points)
         holds = self._table.holds(*arguments, self._failed, ignores_fixtures=in_cavity)
-        # When every grasp has failed, they are tried again; then those that may slip, which at
-        # least move the object.
+        # If every grasp has failed, try them all again. If there is none, try grasps that may slip:
+        # they at least move the object.
         return (
             holds
             or self._table.holds(*arguments, ignores_fixtures=in_cavity)

@@ -29,27 +29,31 @@ from systems.signals import PlanarPose, SurfaceHeights
 Points = NDArray[np.float64]
 
 _CELL = 0.004
-"""Side of the squares in which objects are compared, in metres."""
+"""Side of the squares in which the heights of objects are compared, in metres."""
 _ABOVE = 0.002
-"""An object lies on another if it is above it, to within this, in metres."""
+"""Tolerance, in metres: in a square, an object is above another if its lowest point is at most this
+far below the other's highest point."""
 _LEAST_SQUARES = 2
-"""It covers the other if it is above it in so many squares."""
+"""An object lies on another if it is above it in at least this many squares."""
 _FLAT = math.radians(2.5)
-"""An object tilted less lies flat."""
+"""An object tilted by less than this lies flat, in radians."""
 _SAME_SHAPE = 0.0003
-"""Mean distance, beyond their spacing, of points of two surfaces that count as equal, in metres."""
+"""Two surfaces count as equal if the mean distance between their points exceeds the points' spacing
+by less than this, in metres."""
 _ROLLED = math.radians(20.0)
-"""A round object that rolled is tilted further; other tilts are not by rolling."""
+"""A tilt below this is not caused by rolling, in radians."""
 _ROLLED_PITCH = math.radians(10.0)
-"""The axis of a round object deviates less than this from x of B."""
+"""The axis of a round object deviates by less than this from the x axis of its frame B, in
+radians."""
 _UPSIDE_DOWN = math.radians(120.0)
-"""An object tilted further lies the wrong way up."""
+"""An object tilted by more than this lies upside down, in radians."""
 _ON_EDGE = math.radians(60.0)
-"""An object tilted further, and not upside down, stands on its edge."""
+"""An object tilted by more than this, but not upside down, stands on its edge, in radians."""
 _ALONG_EDGE = (0.0, 0.02, -0.02, 0.04, -0.04)
-"""Where an object that stands on its edge is gripped, along it from its centre, in metres."""
+"""Where an object that stands on its edge is gripped: distances from its centre along its length,
+in metres."""
 _STEEPEST = math.radians(25.0)
-"""Jaws do not hold faces that lean further than this."""
+"""The jaws cannot hold faces that are tilted by more than this from the vertical, in radians."""
 _SLENDER = 0.020
 """Height of a finger's slender tip, in metres."""
 _PALM_ROOM = PALM_HEIGHT - 0.003
@@ -57,7 +61,7 @@ _PALM_ROOM = PALM_HEIGHT - 0.003
 _MARGIN = 0.001
 """Least clearance of the fingers, in metres."""
 _SAME_PLACE, _SAME_ANGLE = 0.006, math.radians(15.0)
-"""A grasp this close to one that failed is the same."""
+"""A grasp closer than this to one that failed counts as the same, in metres and radians."""
 
 
 @dataclass(frozen=True)
@@ -68,21 +72,22 @@ class HeldFromAbove:
     gripper: PlanarPose
     """The gripper's pose in the world."""
     top: float
-    """World z of the object's top between the pads, in metres; `bottom`, `lowest` likewise."""
+    """World z of the top of the part between the pads, in metres; `bottom` is that of its
+    underside."""
     bottom: float
     lowest: float
-    """World z of the whole object's lowest point."""
+    """World z of the whole object's lowest point, in metres."""
     obstruction: int
-    """How many points of other things are in the way of the open hand."""
+    """Number of surface points of other things that are in the way of the open hand."""
 
     def heights(self, highest: float, rim: float) -> SurfaceHeights:
-        """The surfaces for the planner.
+        """The surface heights that the planner needs for this grasp.
 
         Args:
             highest: world z of the highest surface, in metres.
             rim: world z of the rim of the place, in metres; 0 for the table.
         """
-        # The object hangs lower than where it is gripped.
+        # Add how far the object reaches below its gripped part.
         highest += self.bottom - self.lowest
         return SurfaceHeights(
             pick_top=self.top,
@@ -96,28 +101,29 @@ class HeldFromAbove:
 
 @dataclass(frozen=True)
 class ClutteredTable:
-    """The objects, what stands between them, and the hand."""
+    """The objects on a table, the fixed things among them, and the hand that picks them."""
 
     objects: Sequence[PlacedObject]
     grasps: Sequence[Sequence[Grasp]]
     """The grasps of each object, best first."""
     area: tuple[tuple[float, float], tuple[float, float]]
-    """Where objects may be laid aside: lower and upper (x, y) corner, in metres."""
+    """The part of the table where objects may be laid aside: its lower and upper (x, y) corners in
+    the world, in metres."""
     fixtures: Sequence[Points] = ()
-    """(m, 3) points in the world of each thing that never moves."""
+    """For each thing that never moves, points (m, 3) of its surface in the world, in metres."""
     planner: PickPlaceParameters = field(default_factory=PickPlaceParameters)
     ledge: Ledge | None = None
     """A block over whose edges objects can be turned."""
 
     def points(self, poses: Sequence[RigidTransform]) -> list[Points]:
-        """(m, 3) the points of each object in the world."""
+        """For each object, points (m, 3) of its surface in the world, in metres."""
         return [
             X_WB.multiply(item.p_BPoints.T).T
             for item, X_WB in zip(self.objects, poses, strict=True)
         ]
 
     def covered(self, points: Sequence[Points]) -> list[set[int]]:
-        """For each object, those that lie on it."""
+        """For each object, the indices of the objects that lie on it."""
         squares = [_squares(item) for item in points]
         return [
             {
@@ -129,10 +135,12 @@ class ClutteredTable:
         ]
 
     def flat_heading(self, index: int, X_WB: RigidTransform) -> float | None:
-        """The heading of an object that lies as it should lie in its cavity; else None.
+        """The heading, in radians, of an object that lies the way it fits into its cavity; else
+        None.
 
-        It lies flat and the right way up, or its shape does not tell the difference: a round handle
-        may have rolled. The heading is then that of the shape.
+        The object lies flat and the right way up, or has a shape that looks the same after it
+        rolled, such as a round handle. In that case the heading is the one at which the shape looks
+        the same.
         """
         yaw = heading(X_WB)
         if tilt(X_WB) < _FLAT:
@@ -145,7 +153,8 @@ class ClutteredTable:
         yaws = yaw + np.linspace(-_ROLLED_PITCH, _ROLLED_PITCH, 21)
         deviations = [_deviation(item, points, float(angle)) for angle in yaws]
         best = int(np.argmin(deviations))
-        # Two samples of the same surface are as far apart as the points of one.
+        # The points of two samples of the same surface are as far apart as the points of one
+        # sample.
         spacing = float(item.tree.query(item.p_BPoints, k=2)[0][:, 1].mean())
         return float(yaws[best]) if deviations[best] < 1.1 * spacing + _SAME_SHAPE else None
 
@@ -159,15 +168,17 @@ class ClutteredTable:
         ignores_fixtures: bool = False,
         steepest: float = _STEEPEST,
     ) -> list[HeldFromAbove]:
-        """The grasps of an object, best first; without those that failed or would slip.
+        """The grasps of an object, best first, without those that failed before or would slip.
 
         Args:
-            index: the object.
+            index: index of the object.
             poses: X_WB of each object.
-            points: the points of each object in the world.
-            failed: earlier picks in the world that held nothing.
-            steepest: grasps whose faces lean further are left out, in radians.
-            ignores_fixtures: whether fixtures are never in the way, as for an object in a cavity.
+            points: the surface points of each object in the world.
+            failed: gripper poses, in the world, of earlier picks that held nothing.
+            ignores_fixtures: whether fixtures do not count as obstructions. For an object in a
+                cavity they must not.
+            steepest: grasps on faces tilted by more than this from the vertical are left out, in
+                radians.
         """
         around = [item for other, item in enumerate(points) if other != index]
         if not ignores_fixtures:
@@ -186,7 +197,8 @@ class ClutteredTable:
     def _grippers(
         self, index: int, X_WB: RigidTransform, steepest: float
     ) -> list[tuple[Grasp, PlanarPose | None]]:
-        """The grasps, and the gripper's pose in the world for each."""
+        """Each grasp with the gripper's pose in the world; the pose is None if the grasp would
+        slip."""
         if not _ON_EDGE < tilt(X_WB) < _UPSIDE_DOWN:
             return [(grasp, _gripper_pose(X_WB, grasp, steepest)) for grasp in self.grasps[index]]
         # The jaws close along z of B, across the object's thickness.
@@ -227,9 +239,9 @@ class ClutteredTable:
     ) -> PlanarPose | None:
         """Where the gripper lets go of an object to lay it aside; None if there is no room.
 
-        It is a free part of the table. For an object that lies the wrong way up or stands on its
-        edge, it is the edge of the ledge: released there with its centre of mass outside, the
-        object turns over.
+        The place is on a free part of the table. For an object that lies upside down or stands on
+        its edge, it is over an edge of the ledge instead: the object is released with its centre of
+        mass outside the edge, so that it turns over.
         """
         item, X_WB = self.objects[index], poses[index]
         others = [other for k, other in enumerate(points) if k != index]
@@ -237,7 +249,8 @@ class ClutteredTable:
             yaw, p_WCenter = heading(X_WB), X_WB @ item.p_BCenter
             cos, sin = math.cos(yaw), math.sin(yaw)
             outline = (points[index] - p_WCenter)[:, :2] @ np.array([[cos, -sin], [sin, cos]])
-            # An object on its edge falls on the side that faces outward: its lower side.
+            # An object on its edge falls onto the side that faces outward, so its underside must
+            # face outward.
             on_edge = tilt(X_WB) < _UPSIDE_DOWN
             z_left = float(X_WB.rotation().matrix()[:2, 2] @ [-sin, cos])
             turned = self.ledge.turning_pose(
@@ -265,7 +278,8 @@ class ClutteredTable:
 
 
 def _deviation(item: PlacedObject, points: Points, yaw: float) -> float:
-    """Mean distance of points (m, 3), rotated by -yaw and moved, from an object, in metres."""
+    """Mean distance, in metres, of points (m, 3) from an object's surface, after the points are
+    rotated by -yaw and centred on the object."""
     turned = points @ RollPitchYaw(0, 0, -yaw).ToRotationMatrix().matrix().T
     own = item.p_BPoints
     shift = own.min(axis=0) + own.max(axis=0) - turned.min(axis=0) - turned.max(axis=0)
@@ -273,7 +287,8 @@ def _deviation(item: PlacedObject, points: Points, yaw: float) -> float:
 
 
 def middle(points: Points, yaw: float) -> NDArray[np.float64]:
-    """(2,) the middle of the bounding box of points (m, 3), with a side in the direction `yaw`."""
+    """(2,) x and y of the middle of the box around points (m, 3) that has a side in the direction
+    `yaw`."""
     cos, sin = math.cos(yaw), math.sin(yaw)
     along, across = points[:, :2] @ [cos, sin], points[:, :2] @ [-sin, cos]
     u, v = (along.min() + along.max()) / 2, (across.min() + across.max()) / 2
@@ -286,13 +301,13 @@ def tilt(X_WB: RigidTransform) -> float:
 
 
 def in_the_way(points: Points, gripper: PlanarPose, tip: float, halves: tuple[float, float]) -> int:
-    """How many points lie where the hand moves as it comes down with open jaws and closes them.
+    """Counts the points that the hand would hit as it comes down with open jaws and closes them.
 
     Args:
         points: (m, 3) in the world, in metres.
-        gripper: the gripper's pose.
+        gripper: the gripper's pose in the world.
         tip: world z of the fingertips, in metres.
-        halves: half of the opening with the jaws closed and open, in metres.
+        halves: half the opening of the jaws, first closed on the object and then open, in metres.
     """
     along, across = _in_hand(points, gripper)
     along, across, z = np.abs(along), np.abs(across), points[:, 2]
@@ -305,14 +320,16 @@ def in_the_way(points: Points, gripper: PlanarPose, tip: float, halves: tuple[fl
 
 
 def _in_hand(points: Points, gripper: PlanarPose) -> tuple[Points, Points]:
-    """Coordinates along the pads and across them, in metres."""
+    """Coordinates of points in the gripper's frame, first along the pads and then across them, in
+    metres."""
     cos, sin = math.cos(gripper.theta), math.sin(gripper.theta)
     dx, dy = points[:, 0] - gripper.x, points[:, 1] - gripper.y
     return cos * dx + sin * dy, cos * dy - sin * dx
 
 
 def _gripper_pose(X_WB: RigidTransform, grasp: Grasp, steepest: float) -> PlanarPose | None:
-    """The gripper's pose in the world; None if the gripped faces lean too far."""
+    """The gripper's pose in the world; None if the gripped faces are tilted by more than
+    `steepest`."""
     R = X_WB.rotation().matrix()
     across = R @ np.array([-math.sin(grasp.theta), math.cos(grasp.theta), 0.0])
     if abs(across[2]) > math.sin(steepest):
@@ -331,7 +348,8 @@ Squares = dict[tuple[int, int], tuple[float, float]]
 
 
 def _squares(points: Points) -> Squares:
-    """Lowest and highest z of points (m, 3) in each square of the table that has some."""
+    """The lowest and highest z of the points (m, 3) in each square of the table, for squares with
+    points."""
     keys, where = np.unique(
         np.floor(points[:, :2] / _CELL).astype(int), axis=0, return_inverse=True
     )

@@ -12,14 +12,14 @@ from systems.pick_place_parameters import Mode
 from systems.planner_state import RECENT, PlannerState
 
 HEAVIEST = 3.0
-"""The payload of a Franka Hand, in kg. What pulls harder is not a weight."""
+"""Largest payload of a Franka arm, in kg. A stronger pull is not the weight of an object."""
 _LASTING = 1 / 64
-"""Peaks are means over this time, in s. In modes that expect contact, a force above the limit must
-last this long: an impact passes before the hand can react to it, a jam does not."""
+"""Peak forces are means over this time, in s. In modes that expect contact, the guard acts only if
+a force above the limit lasts longer than this: an impact is shorter, a jam is longer."""
 _WEIGHINGS = 16
 """The payload is averaged over about this many samples."""
 _CLEAR = 0.001
-"""The payload is weighed from this far below the travel height on, in m."""
+"""The payload is weighed while the hand is at most this far below the travel height, in m."""
 
 _UNWEIGHED = (Mode.LIFT, Mode.CARRY)
 """The modes in which an object of unknown weight may be in the hand."""
@@ -30,14 +30,15 @@ _AT_REST = (Mode.OBSERVE, Mode.DONE)
 
 
 def known_payload(state: PlannerState) -> float:
-    """The vertical force of the payload while it is carried and lowered, in N; zero before."""
+    """The vertical force of the payload on the hand, in N, negative downwards. It is zero until the
+    payload has been weighed, and after it is placed."""
     mode = Mode(int(state.mode))
     weighed = mode == Mode.CARRY and state.weighings >= _WEIGHINGS / 2
     return state.payload if weighed or mode in (Mode.LOWER, Mode.SEARCH) else 0.0
 
 
 class ContactGuard:
-    r"""The law of the force guard.
+    r"""Computes contact forces without the payload, and stops the hand if one exceeds a limit.
 
     Let f be the contact force on the hand, m the mass of the held object, a the commanded
     acceleration and g gravity. The contact force without the payload is
@@ -45,18 +46,21 @@ class ContactGuard:
         vertical = f_z + m (g + a_z),    lateral = |f_xy + m a_xy|.
 
     - m is zero while the hand is empty.
-    - `LIFT`, and `CARRY` until the object is weighed: m is what explains f_z, at most `HEAVIEST`.
-    - `CARRY`, while the hand is above the travel height, weighs the object: m is the mean of
-      -f_z / (g + a_z). Contact further down therefore does not count as payload.
-    - `RELEASE`, `RETREAT`: f_z may be anything between the object's weight and zero.
+    - In `LIFT`, and in `CARRY` until the object is weighed, m is the mass that makes the vertical
+      force zero, but between 0 and `HEAVIEST`.
+    - In `CARRY`, while the hand is above the travel height, the object is weighed: m is the mean of
+      -f_z / (g + a_z). A contact further down therefore does not count as payload.
+    - In `RELEASE` and `RETREAT` the object may still hang in the jaws or not, so any f_z between
+      its weight and zero counts as no contact.
 
-    The guard acts if the vertical or the lateral force exceeds the limit: at once in `APPROACH` and
-    `CARRY`, where nothing should touch, else after 1/64 s. A push from below does not count while
-    the hand rises, nor while it presses an object down, where `press_force` rules.
+    The guard acts if the vertical or the lateral force exceeds the limit. In `APPROACH` and
+    `CARRY`, where nothing should touch the hand, it acts at once; in other modes, after 1/64 s. A
+    push from below does not count while the hand rises. Vertical forces do not count while it
+    presses an object down; there `press_force` is the limit.
 
     A peak is the largest mean over 1/64 s, as a wrist sensor would show it. In a shorter time the
     force of an impact is its impulse divided by the plant's step, and so depends on the step. If
-    the guard acts, the force at that moment counts, too.
+    the guard acts, the force at that moment counts as well.
     """
 
     def __init__(self, limit: float, step: float) -> None:
@@ -69,7 +73,7 @@ class ContactGuard:
         self._samples = min(max(round(_LASTING / step), 1), RECENT)
 
     def reset(self, state: PlannerState) -> None:
-        """Forgets the peaks and the payload of the last action."""
+        """Clears the peaks and the payload of the last action."""
         state.payload = state.weighings = state.beyond = 0.0
         state.peak_vertical = state.peak_lateral = 0.0
         state.recent = np.zeros(3 * RECENT)
@@ -82,13 +86,13 @@ class ContactGuard:
         height: float,
         acceleration: NDArray[np.float64],
     ) -> bool:
-        """Takes one sample of the contact force; to be called in all modes.
+        """Processes one sample of the contact force. Call it at every step, in all modes.
 
         Args:
             state: the planner's state; its payload and its peaks are updated.
-            contact: (6) the port `hand_contact_force`.
-            height: the height of the fingertips, in m.
-            acceleration: (3) commanded, in m/s^2.
+            contact: (6) value of the port `hand_contact_force`.
+            height: the height of the fingertips in the world, in m.
+            acceleration: (3) commanded acceleration of the hand in the world, in m/s^2.
 
         Returns:
             Whether the hand must stop.
@@ -122,12 +126,13 @@ class ContactGuard:
         return must_stop
 
     def tare(self, state: PlannerState, contact: NDArray[np.float64], threshold: float) -> None:
-        """Sets the payload to the force at rest, unless something else touches already.
+        """Sets the payload to the vertical force at rest, unless that differs too much from the
+        weighed payload: then something else touches the hand or the object.
 
         Args:
             state: the planner's state, at the end of `CARRY`.
-            contact: (6) the port `hand_contact_force`.
-            threshold: a vertical force that counts as contact, in N.
+            contact: (6) value of the port `hand_contact_force`.
+            threshold: the vertical force that counts as contact, in N.
         """
         felt, weighed = float(contact[2]), float(state.payload)
         if not state.weighings or abs(felt - weighed) < threshold / 2 - 0.1 * weighed:

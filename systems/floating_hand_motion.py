@@ -20,25 +20,25 @@ from systems.pick_place_parameters import Mode, PickPlaceParameters
 from systems.planner_state import YAW, PlannerState, X, Y, Z
 
 YAW_LIMIT = 3.4
-"""Largest yaw of the wrist either way, in rad, just short of its joint limit."""
+"""Largest yaw of the wrist in either direction, in rad; slightly less than its joint limit."""
 _NEARLY_THERE = 0.02
 """Within this horizontal distance of its goal, in m, the hand may sink below the clear height."""
 TRIAL = 0.010
-"""How far an object is lifted to see how it hangs, in m: clear of the table, but not much more."""
+"""How far an object is lifted for a trial of the grasp, in m: just clear of the table."""
 _OVERSHOOT = 0.05
-"""How far above the travel height a lift aims, in m, so that the hand passes it without a stop."""
+"""How far above the travel height the goal of a lift is, in m, so that the hand passes that height
+without a stop."""
 
 
 class HandMotion(JawMotion):
-    """Motions, jaw openings and closing forces of all modes, as functions of the state. See
-    `RobotMotion`."""
+    """Implements `RobotMotion` for the floating hand."""
 
     size = 12
 
     def __init__(self, parameters: PickPlaceParameters) -> None:
         """
         Args:
-            parameters: heights, speeds, forces.
+            parameters: heights, speeds and forces of the motion primitive.
         """
         super().__init__(parameters)
         self._limits = parameters.motion_limits()
@@ -52,11 +52,11 @@ class HandMotion(JawMotion):
         return vector
 
     def view(self, vector: NDArray[np.float64]) -> PlannerState:
-        """The fields of a state vector."""
+        """Names the fields of a state vector, without a copy."""
         return PlannerState(vector)
 
     def prepare(self, state: PlannerState) -> bool:
-        """Chooses the equivalent yaws that rotate the wrist least."""
+        """Chooses, among equivalent yaws at pick and place, those that rotate the wrist least."""
         state.pick[2], state.place[2] = shortest_yaws(
             float(state.pick[2]), float(state.place[2]), float(state.goal[YAW]), YAW_LIMIT
         )
@@ -83,7 +83,7 @@ class HandMotion(JawMotion):
         state.start_time = time
         state.start = now
         state.start_rate = rate
-        # Default: brake to rest.
+        # The default goal is where the hand comes to rest if it brakes.
         state.goal = now + rate * braking_time(rate, self._limits_of(state)) / 2
         self._set_goals(state, mode)
         self.set_times(state)
@@ -119,22 +119,22 @@ class HandMotion(JawMotion):
         limits = self._limits_of(state)
         rate = state.start_rate
         braking = braking_time(rate, limits)
-        # An axis that still moves brakes first.
+        # An axis that still moves brakes before it travels.
         delays = np.array([braking * bool(rate[part].any()) for part in PARTS])
         ways = np.abs(state.goal - state.start - rate * braking / 2)
         across, height = float(np.linalg.norm(ways[:2])), float(ways[2])
         of_plane, of_height, _ = limits.of_parts()
         if mode == Mode.CARRY:
-            # After half of the braking time the preceding lift is almost complete.
+            # Travel across only when the lift is almost complete, after half of the braking time.
             delays = np.maximum(delays, braking / 2)
         if mode in (Mode.APPROACH, Mode.CARRY):
-            # Sink near the goal only.
+            # Delay the descent until the hand is near its goal.
             clear = state.clear_z if mode == Mode.APPROACH else state.travel_z
             nearly_there = delays[0] + time_to_reach(across - _NEARLY_THERE, across, *of_plane)
             sinks = height - (clear - state.goal[Z])
             delays[1] = max(delays[1], nearly_there - time_to_reach(sinks, height, *of_height))
         elif mode == Mode.RETREAT:
-            # Rise first.
+            # Delay the horizontal motion until the hand has risen.
             rises = height - (state.goal[Z] - state.travel_z)
             delays[0] = max(delays[0], delays[1] + time_to_reach(rises, height, *of_height))
         state.delays = delays
@@ -145,8 +145,8 @@ class HandMotion(JawMotion):
         state.duration = motion_duration(state.start, state.goal, rate, limits, delays, legs)
 
     def _set_legs(self, state: PlannerState, mode: Mode) -> None:
-        """Divides a guarded motion: fast above all surfaces, then slower, and slowest where contact
-        is expected."""
+        """Divides a motion down into legs: fast above all surfaces, then slower, and slowest where
+        contact is expected."""
         first, expected = guarded_marks(state, mode, self._parameters)
         marks = [float(state.start[Z])]
         for mark in (first, expected, float(state.goal[Z])):
@@ -180,7 +180,8 @@ class HandMotion(JawMotion):
         self.set_times(state)
 
     def motion_at(self, state: PlannerState, time: float) -> NDArray[np.float64]:
-        """q_d, v_d, a_d (12) of the present mode's motion."""
+        """(12) the hand's desired position, velocity and acceleration, each as x, y, z, yaw, in the
+        present mode."""
         if time >= state.start_time + state.duration:
             return np.concatenate([state.goal, np.zeros(8)])
         return motion_at(
@@ -196,11 +197,11 @@ class HandMotion(JawMotion):
     def hand_acceleration(
         self, state: PlannerState, time: float, desired: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """(3) of the motion `desired`. See `RobotMotion`."""
+        """(3) acceleration of the fingertips in the world, in m/s^2, taken from `desired`."""
         return desired[8:11]
 
     def arrival(self, state: PlannerState) -> float:
-        """When all of the present mode has arrived. See `RobotMotion`."""
+        """The time at which the present mode is complete. See `RobotMotion`."""
         return self.jaws_arrival(state, state.start_time + state.duration)
 
     def brakes_above(self, state: PlannerState, time: float, height: float) -> bool:

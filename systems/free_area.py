@@ -12,15 +12,16 @@ from systems.signals import PlanarPose
 _CELL = 0.005
 """Side of the squares that are free or occupied, in metres."""
 _STEP = 0.015
-"""Distance of the places that are tried, in metres."""
+"""Spacing of the positions that are tried, in metres."""
 _YAWS = 8
 """The number of headings that are tried, over a full turn."""
 _LEAST = 0.010
-"""Least clearance of the object, in metres."""
+"""Least clearance around the object, in metres."""
 _AMPLE = 0.060
-"""More clearance than this is not better: the open hand has room."""
+"""Clearance beyond this has no benefit, because the open hand already has room, in metres."""
 _WAY = 0.02
-"""Clearance that makes up for a way of one metre, in metres."""
+"""A position one metre farther away must have this much more clearance to be preferred, in
+metres."""
 
 
 def find_free_pose(
@@ -31,14 +32,16 @@ def find_free_pose(
     near: NDArray[np.float64],
     yaw: float,
 ) -> PlanarPose | None:
-    """The pose of an object at which it has the most clearance; None if it fits nowhere.
+    """The pose in the world at which an object has the most clearance; None if it fits nowhere.
 
     Args:
         outline: (k, 2) points that cover the object, in its frame, in metres.
-        occupied: (m, 2) points that cover everything else, in the world.
-        area: lower and upper corner of the table's part, in the world.
-        near: (2,) of equally good places, the one nearest to this point is chosen.
-        yaw: the headings that are tried include this one, in radians.
+        occupied: (m, 2) points that cover everything else, in the world, in metres.
+        area: lower and upper (x, y) corners of the part of the table to search, in the world, in
+            metres.
+        near: (2,) point in the world, in metres. Among positions with similar clearance, those near
+            it are preferred.
+        yaw: one of the headings to try, in radians; the others are evenly spaced from it.
     """
     # Import SciPy lazily.
     from scipy import ndimage

@@ -1,4 +1,4 @@
-"""Grasps from above."""
+"""A grasp of an object from above."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ class Grasp:
     """A planar grasp in the body frame B of an object in its nominal resting pose."""
 
     x: float
-    """Coordinates of the point midway between the pads, in B, in metres. Likewise `y`."""
+    """x of the point midway between the pads, in B, in metres; `y` is its y coordinate."""
     y: float
     theta: float
     """Rotation of the hand about B's z, in radians; at zero the jaws close along B's y."""

@@ -5,29 +5,30 @@ import numpy as np
 from systems.pick_place_parameters import PickPlaceParameters
 
 GRAVITY = 9.81
-"""In m/s^2."""
+"""Acceleration of gravity, in m/s^2."""
 
 _TOO_EARLY = 1.5
-"""A grip that is weaker than it should be by this factor must be firm before the object is lifted.
+"""If the grip force should be more than this factor larger, the object is not lifted until it is.
 """
 _EASY_MOMENT = 0.18
-"""A moment about the axis of the pads that they hold easily, in N m."""
+"""A moment about the axis of the pads that friction holds easily, in N m."""
 _INDULGENCE = 0.5
-"""After an object was set down, this much more is allowed, as a share, for each time."""
+"""Each time an object was set down again, the allowed moment grows by this share."""
 _LONGEST_LEVER = 0.12
-"""In m."""
+"""Largest plausible distance of a centre of mass from the pads' middle, in m."""
 _LEAST_CHANGE = 1.05
-"""The force rises in steps of at least this factor, so that its ramp is not restarted for noise."""
+"""The force rises only in steps of at least this factor, so that noise does not restart its
+ramp."""
 
 
 def felt_weight(contact_force: float, acceleration: float) -> float:
-    """The weight of what the hand holds, in N.
+    """The weight of the object in the hand, in N.
 
     Args:
         contact_force: the vertical contact force on the hand, in N; negative for a load.
         acceleration: the hand's vertical acceleration, in m/s^2.
     """
-    # The hand never falls freely, but an odd parameter must not divide by zero.
+    # The hand never falls freely, but unusual parameters must not cause a division by zero.
     return -contact_force / max(1 + acceleration / GRAVITY, 0.1)
 
 
@@ -35,12 +36,13 @@ def grip_force(weight: float, present: float, parameters: PickPlaceParameters) -
     """The force of each pad on an object of a given weight, in N.
 
     It is proportional to the weight up to `firm_grasp_force` at `heavy_load`, but at least
-    `grasp_force`. Above, it rises linearly to `peak_grasp_force` at `heaviest_load`. It never
-    falls while the object is held: what has begun to turn between the pads must not go on.
+    `grasp_force`. Beyond `heavy_load` it rises linearly to `peak_grasp_force` at `heaviest_load`.
+    The force never falls while the object is held: with less force, an object that has begun to
+    turn between the pads would turn further.
 
     Args:
-        weight: what the hand feels, in N.
-        present: the present force, in N.
+        weight: the weight that the hand feels, in N.
+        present: the present force of each pad, in N.
         parameters: the forces and loads.
     """
     heavy, heaviest = parameters.heavy_load, max(parameters.heaviest_load, parameters.heavy_load)
@@ -57,26 +59,28 @@ def grip_force(weight: float, present: float, parameters: PickPlaceParameters) -
 
 
 def moment_at_rest(moment: float, acceleration: float) -> float:
-    """The moment about the axis of the pads without the part of a rising hand's inertia, in N m.
+    """The moment about the axis of the pads that the object would exert at rest, in N m.
 
-    A braking hand lags behind its command, so its moment is taken as it is.
+    An upward acceleration increases the felt moment, and is corrected for. While the hand brakes,
+    it lags behind its command, so no correction is made.
 
     Args:
-        moment: felt at the wrist, in N m.
+        moment: the moment felt at the wrist, in N m.
         acceleration: the hand's vertical acceleration, in m/s^2.
     """
     return moment / max(1 + acceleration / GRAVITY, 1.0)
 
 
 def felt_lever(moment: float, weight: float) -> float:
-    """How far the centre of mass lies from the pads' middle along the hand's x axis, in m.
+    """Position of the object's centre of mass relative to the pads' middle, along the hand's x
+    axis, in m.
 
-    This is right even while one end of the object still rests on the table near its centre of mass,
-    since both moment and weight are less then.
+    The estimate also holds while one end of the object rests on the table, because moment and
+    weight are then reduced together.
 
     Args:
         moment: about the axis of the pads while the hand rests, in N m.
-        weight: of `felt_weight`, in N.
+        weight: the result of `felt_weight`, in N.
     """
     return min(max(moment / max(weight, 1e-3), -_LONGEST_LEVER), _LONGEST_LEVER)
 
@@ -86,8 +90,8 @@ def turns_in_the_pads(moment: float, times: float) -> bool:
 
     Args:
         moment: about the axis of the pads while the hand rests, in N m.
-        times: how often this object was set down because of this. The more often, the more is
-            allowed, so that it comes to an end.
+        times: how often this object was set down because it turned. Each time, a larger moment is
+            allowed, so that the attempts end.
     """
     return abs(moment) > _EASY_MOMENT * (1 + _INDULGENCE * times)
 
@@ -96,7 +100,7 @@ def lifts_too_early(wanted: float, present: float) -> bool:
     """Whether the pads press far less than they should, so that the object would turn between them.
 
     Args:
-        wanted: the force of `grip_force`, in N.
+        wanted: the result of `grip_force`, in N.
         present: the force of the pads now, in N.
     """
     return wanted > _TOO_EARLY * present

@@ -1,4 +1,4 @@
-"""Where guarded motions slow down."""
+"""Computes the heights at which the hand slows down while it descends."""
 
 from systems.pick_place_parameters import Mode, PickPlaceParameters
 from systems.planner_state import PlannerState
@@ -7,7 +7,7 @@ from systems.planner_state import PlannerState
 def guarded_marks(
     state: PlannerState, mode: Mode, parameters: PickPlaceParameters
 ) -> tuple[float, float]:
-    """Heights of the fingertips in a guarded motion, in m.
+    """Two heights of the fingertips at which a descending hand slows down, in m.
 
     Args:
         state: the planner's state.
@@ -15,15 +15,17 @@ def guarded_marks(
         parameters: clearances and margins.
 
     Returns:
-        The height down to which the hand is above all surfaces near its goal, and that from which
-        on contact is expected. They may be below the goal.
+        The first height is a margin above all surfaces near the goal. From the second one downwards
+        contact is expected. Both may be below the goal.
     """
     margin = parameters.slow_margin + state.doubt
     hover = state.pick_hover_z if mode == Mode.DESCEND else state.place_hover_z
     first = hover - parameters.hover_clearance + margin
     if mode == Mode.DESCEND:
-        # The jaws should touch nothing, except to press.
+        # Contact is expected only if the hand presses; on the way to a grasp the jaws should touch
+        # nothing.
         return first, state.pick_top_z + margin if state.press else state.grasp_z
-    # Either the object reaches its floor, or the fingertips beside it the rim.
+    # The first contact is that of the object with the floor of its place, or that of the fingertips
+    # with the rim beside it.
     hanging = state.hold_z - state.support_z
     return first, max(state.floor_z + hanging, state.rim_z + state.doubt) + margin

@@ -1,6 +1,7 @@
 """Dimensions of the Franka hand model in `models/franka_hand`, in metres.
 
-Gripper frame G: origin midway between the fingertip ends, z up; the jaws close along y.
+The gripper frame G has its origin midway between the fingertip ends. Its z axis points up, and the
+jaws close along y.
 """
 
 import numpy as np
@@ -16,7 +17,7 @@ FINGER_DEPTH = 0.0263
 FINGERTIP_DEPTH = 0.015
 """Extent of a finger along G's y near the fingertip, from its pad outwards."""
 MAX_OPENING = 0.080
-"""Distance between the pads of the open jaws."""
+"""Distance between the pads of the fully open jaws."""
 PALM_SIZE = (0.064, 0.209)
 """Extents of the palm along G's x and y."""
 PALM_HEIGHT = 0.0461
@@ -26,7 +27,7 @@ FINGERTIP_DISTANCE = 0.1121
 FINGER_BASE_DISTANCE = 0.0584
 """Distance from the hand's flange to the origin of the finger meshes, along G's z."""
 JOINT_LIMITS = {"x": (-1.0, 1.5), "y": (-1.5, 1.5), "z": (-0.05, 1.2), "yaw": (-3.5, 3.5)}
-"""Limits of the joints that move G, in metres and rad."""
+"""Limits of the floating hand's joints, which move G, in metres and radians."""
 
 
 def check_reach(action: PickPlaceAction) -> None:

@@ -13,7 +13,7 @@ SMOOTHING = 1 / 16
 """Rise time of the acceleration, in s."""
 
 PARTS = ([0, 1], [2], [3])
-"""The axes that share a time course: (x, y), z and yaw."""
+"""Indices of the axes that move in step with each other: (x, y), z and yaw."""
 
 
 @dataclass(frozen=True)
@@ -33,32 +33,32 @@ class MotionLimits:
 
 @dataclass(frozen=True)
 class Leg:
-    """A part of a way along z with a speed of its own."""
+    """A part of a motion along z with its own speed."""
 
     way: float
-    """Signed, in m."""
+    """Displacement along z, signed, in m."""
     speed: float
-    """In m/s."""
+    """Largest speed, in m/s."""
     delay: float
-    """When it begins, in s after the start of the motion."""
+    """Time at which the leg begins, in s after the start of the motion."""
 
 
 def blended_legs(
     ways: Sequence[float], speeds: Sequence[float], acceleration: float
 ) -> tuple[Leg, ...]:
-    """Legs of one way with different speeds, without stops between them.
+    """Computes legs with different speeds along one line, without stops between them.
 
-    Each leg begins when the one before begins to brake. The sum of two such `travel`s changes its
-    speed from the one to the other. A leg is shortened so that its speed has gone where it should
-    end; if it is too short for that, the next leg covers its way, too.
+    Each leg begins when the one before begins to brake. The sum of the two motions then changes
+    smoothly from one speed to the other. A leg is shortened so that it has stopped at the point
+    where it should end; if it is too short for that, the next leg covers its distance as well.
 
     Args:
         ways: the lengths of the legs, in order, in m; all of one sign, or zero.
-        speeds: the speed of each, in m/s.
-        acceleration: the limit, in m/s^2.
+        speeds: the largest speed of each leg, in m/s.
+        acceleration: the largest acceleration, in m/s^2.
 
     Returns:
-        One for each way; its way is zero if the others cover it.
+        One leg for each element of `ways`. Its displacement is zero if the next leg covers it.
     """
     legs = [Leg(0.0, speed, 0.0) for speed in speeds]
     used = [index for index, way in enumerate(ways) if way]
@@ -67,7 +67,7 @@ def blended_legs(
         length, speed = abs(ways[index]) + left, speeds[index]
         left = 0.0
         if following is not None:
-            # By the time at which this leg has stopped, the next one has come so far.
+            # Distance that the next leg covers until this leg has stopped.
             stopping = min(speed, math.sqrt(length * acceleration)) / acceleration + SMOOTHING
             ahead = travel(abs(ways[following]), speeds[following], acceleration, stopping)
             left = min(ahead[0], length)
@@ -82,17 +82,17 @@ def blended_legs(
 def travel(
     distance: float, speed: float, acceleration: float, elapsed: float
 ) -> tuple[float, float, float]:
-    """Position, velocity and acceleration at a time of a motion from rest to rest.
+    """Position, velocity and acceleration, at a given time, of a motion from rest to rest.
 
     The velocity is a trapezoid, or a triangle over short distances, averaged over the last
     `SMOOTHING` seconds. The acceleration is therefore continuous. The position is a sum of
     truncated cubics, one for each of the eight corners of the acceleration.
 
     Args:
-        distance: not negative, in m or rad.
-        speed: the limit, in units per s.
-        acceleration: the limit, in units per s^2.
-        elapsed: time since the start, in s; before it, the motion is at rest at zero.
+        distance: length of the motion, not negative, in m or rad.
+        speed: largest speed, in m/s or rad/s.
+        acceleration: largest acceleration, in m/s^2 or rad/s^2.
+        elapsed: time since the start, in s. Before the start the motion is at rest at zero.
     """
     if elapsed <= 0 or distance <= 0:
         return 0.0, 0.0, 0.0
@@ -147,7 +147,7 @@ def braking_time(rate: NDArray[np.float64], limits: MotionLimits) -> float:
     half of rate times braking time.
 
     Args:
-        rate: (4) velocity: vx, vy, vz, vyaw.
+        rate: (4) velocities of x, y, z and yaw, in m/s and rad/s.
         limits: only the accelerations are used.
     """
     vx, vy, vz, vyaw = map(float, rate)
@@ -167,24 +167,24 @@ def motion_at(
     elapsed: float,
     legs: Sequence[Leg] = (),
 ) -> NDArray[np.float64]:
-    """State at a time of the motion from a start with a given velocity to rest at a goal.
+    """State, at a given time, of the motion from a start with a given velocity to rest at a goal.
 
     The motion is the sum of two: braking from the start velocity (see `braking_time`), and for each
     of the `PARTS` a `travel` over the remaining distance that begins after its delay.
 
     Args:
-        start: (4) position.
-        goal: (4) position.
-        start_rate: (4) velocity at the start.
+        start: (4) position x, y, z, yaw at the start, in m and rad.
+        goal: (4) position at the goal.
+        start_rate: (4) velocity at the start, in m/s and rad/s.
         limits: the limits of each of the `PARTS`.
         delays: (3) when the `travel` of each part begins, in s after the start.
         elapsed: time since the start, in s.
-        legs: if given, the ways of z, instead of one `travel`.
+        legs: if given, the legs along z, which replace its single `travel`.
 
     Returns:
         (12) position, velocity, acceleration.
     """
-    # Plain floats: this runs at every step, and NumPy is slower for four elements.
+    # Use plain floats: this runs at every step, and NumPy is slower for four elements.
     position, velocity, acceleration = start.tolist(), [0.0] * 4, [0.0] * 4
     braking = braking_time(start_rate, limits)
     if braking > 0:
@@ -228,8 +228,8 @@ def _ways(
     delays: NDArray[np.float64],
     legs: Sequence[Leg],
 ) -> Iterator[tuple[list[int], list[float], float, tuple[float, float], float]]:
-    """For each part, or leg: its axes, its displacement after braking, the length of this
-    displacement, its limits and its delay."""
+    """Yields, for each of the `PARTS` or each leg: the indices of its axes, its displacement after
+    braking, the norm of the displacement, its (speed, acceleration) limits, and its delay in s."""
     ways = (goal - start - start_rate * braking_time(start_rate, limits) / 2).tolist()
     for part, limit, delay in zip(PARTS, limits.of_parts(), delays.tolist(), strict=True):
         if legs and part == PARTS[1]:
@@ -241,7 +241,8 @@ def _ways(
 
 
 def ramp(start: float, goal: float, rate: float, elapsed: float) -> tuple[float, float]:
-    """Value and rate of a ramp of constant rate that stops at its goal."""
+    """Value and rate, at a time since the start, of a ramp with a constant rate that stops at its
+    goal."""
     distance = goal - start
     travelled = rate * max(elapsed, 0.0)
     if travelled >= abs(distance):
@@ -252,25 +253,26 @@ def ramp(start: float, goal: float, rate: float, elapsed: float) -> tuple[float,
 def shortest_yaws(
     pick_yaw: float, place_yaw: float, present_yaw: float, limit: float
 ) -> tuple[float, float]:
-    """The equivalent pick and place yaws, within a limit, that rotate the wrist least.
+    """Of all equivalent pick and place yaws within a limit, chooses those that rotate the wrist
+    least.
 
     The jaws are symmetric: both yaws may be rotated by pi together, and each by 2 pi.
 
     Args:
-        pick_yaw: in rad.
-        place_yaw: in rad.
+        pick_yaw: the wrist's yaw at the pick, in rad.
+        place_yaw: the wrist's yaw at the place, in rad.
         present_yaw: the wrist's present yaw, in rad.
         limit: the largest magnitude of a yaw, in rad; at least pi, so that a solution exists.
 
     Returns:
-        (pick, place) in rad.
+        (pick, place) yaws in rad.
     """
     candidates = []
     for half_turn in (0.0, math.pi):
         for pick in _within(pick_yaw + half_turn, limit):
             for place in _within(place_yaw + half_turn, limit):
                 candidates.append((pick, place))
-    # Ties: prefer yaws near the middle of the range.
+    # If two choices rotate the wrist equally, prefer yaws near the middle of the range.
     return min(
         candidates,
         key=lambda yaws: (

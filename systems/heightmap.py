@@ -16,9 +16,9 @@ from systems.signals import Observation, PixelGrid
 from systems.table_plane import level
 
 _DEEPEST = 0.05
-"""Points farther than this below `grid.z_min` are ignored, in metres."""
+"""Points more than this below `grid.z_min` are ignored, in metres."""
 _ROUNDING = 1e-5
-"""Heights are computed to better than this, in metres."""
+"""Upper limit of the rounding error of a height, in metres."""
 SAME_SURFACE = 0.01
 """Heights that differ by less than this belong to one surface, in metres."""
 
@@ -75,9 +75,10 @@ class View(NamedTuple):
     """The images of one camera and the pose from which they were taken."""
 
     color: NDArray[np.uint8] | None
-    """(height, width, 3 or more): red, green, blue. None reads as black."""
+    """(height, width, 3 or more) red, green and blue from 0 to 255. None stands for a black
+    image."""
     depth: NDArray[np.float32]
-    """(height, width) along the optical axis, in metres; 0, infinity and NaN are invalid."""
+    """(height, width) depths along the optical axis, in metres; 0, infinity and NaN are invalid."""
     X_WD: NDArray[np.float64]
     """(4, 4) pose of the camera's optical frame in the world."""
     rays: DepthRays
@@ -86,12 +87,12 @@ class View(NamedTuple):
 def project(
     views: Sequence[View], grid: PixelGrid, region: NDArray[np.bool_] | None = None
 ) -> Observation:
-    """Computes o_t as `HeightmapProjector` documents.
+    """Computes o_t with the method that the docstring of `HeightmapProjector` describes.
 
     Args:
         views: one for each camera, at least one.
         grid: the pixels of the heightmap.
-        region: (rows, cols), the pixels of interest; None for all. The others count as out of
+        region: (rows, cols) mask of the pixels to compute; None for all. The others count as out of
             view.
     """
     in_view = np.any([looks_at(view, grid) for view in views], axis=0)
@@ -112,11 +113,13 @@ def project(
 
 
 def looks_at(view: View, grid: PixelGrid) -> NDArray[np.bool_]:
-    """(rows, cols): the pixels that are in a camera's image at the height of the table."""
+    """(rows, cols) mask of the grid pixels whose point at height `z_min` lies in a camera's
+    image."""
     rays, X_WD = view.rays, view.X_WD
     corner = grid.to_world((0, 0))
     steps = grid.resolution * np.arange(max(grid.shape))
-    # A pixel's position in the camera's frame is linear in its row and column: sum the two parts.
+    # A grid pixel's position in the camera's frame is a constant plus one term for its row and one
+    # for its column.
     offset = X_WD[:3, :3].T @ (np.array([*corner, grid.z_min]) - X_WD[:3, 3])
     x, y, z = (
         offset[k] + X_WD[0, k] * steps[: grid.rows, None] + X_WD[1, k] * steps[None, : grid.cols]
@@ -129,7 +132,7 @@ def looks_at(view: View, grid: PixelGrid) -> NDArray[np.bool_]:
 
 
 def _see(view: View, grid: PixelGrid) -> NDArray[np.float32]:
-    """One camera's heightmap: (4, rows, cols) red, green, blue, and height above `grid.z_min`.
+    """One camera's heightmap, (4, rows, cols): red, green, blue, and the height above `grid.z_min`.
 
     The height is -inf where nothing is seen.
 
@@ -138,7 +141,8 @@ def _see(view: View, grid: PixelGrid) -> NDArray[np.float32]:
     """
     rays, depth = view.rays, view.depth
     p_WD = view.X_WD[:3, 3]
-    ends = view.X_WD[:3, :3].T + p_WD  # World points one metre along each axis of D.
+    # World points one metre from the camera along each axis of D.
+    ends = view.X_WD[:3, :3].T + p_WD
     origin = np.append(grid.to_pixel(p_WD[:2]), p_WD[2] - grid.z_min)
     axes = np.column_stack([grid.to_pixel(ends[:, :2]), ends[:, 2] - grid.z_min]) - origin
     origin[:2] += 0.5  # Truncation then finds the nearest pixel centre.
@@ -166,7 +170,8 @@ def _see(view: View, grid: PixelGrid) -> NDArray[np.float32]:
     cell = row.astype(np.int64) * grid.cols + col.astype(np.int64)
 
     # Rounding may put points of the table slightly below it. They get height 0, so that all points
-    # of the table are equally high; the last one gives the colour. Adding 0 turns -0 into +0.
+    # of the table are equally high, and the last of them gives the colour. Adding 0 turns -0 into
+    # +0.
     z = np.where((z < 0) & (z > -_ROUNDING), 0, z) + np.float32(0)
     # `_sortable` gives integers in the order of the heights. They become the upper bits of a key,
     # and the point's index the lower ones. The maximum key then has the highest point's colour.
@@ -187,19 +192,21 @@ def _see(view: View, grid: PixelGrid) -> NDArray[np.float32]:
 
 
 def _sortable(values: NDArray[np.float32]) -> NDArray[np.int32]:
-    """The bits of numbers, ordered as the numbers are; its own inverse."""
+    """Maps float32 numbers to integers of the same order, bit by bit. Applied to its result, it
+    returns the numbers' bits."""
     bits = values.view(np.int32)
     return np.where(bits < 0, bits ^ np.int32(0x7FFFFFFF), bits)
 
 
 def _fuse(views: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """The fused image (4, rows, cols) of the cameras' (n, 4, rows, cols), and its valid mask.
+    """Fuses the heightmaps of n cameras (n, 4, rows, cols) to one (4, rows, cols), with its mask of
+    valid pixels.
 
-    Heights are above `grid.z_min`, and negative below it.
+    Heights are relative to `grid.z_min`.
     """
     height = views[:, 3].max(axis=0)
     seen = height > -np.inf
-    # Whatever is below the table counts as its surface.
+    # Clamp points below the table to its surface.
     heights = np.maximum(views[:, 3], 0)
     on_top = (views[:, 3] > -np.inf) & (heights >= heights.max(axis=0) - np.float32(SAME_SURFACE))
     image = np.empty_like(views[0])

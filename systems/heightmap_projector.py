@@ -48,7 +48,7 @@ class HeightmapProjector(LeafSystem):
       cameras that see the top surface, i.e. whose height is within SAME_SURFACE (1 cm) of it. The
       others see a side, or the ground in front.
     - A table that seems tilted by up to 2 degrees, or up to 1 cm off `z_min`, is levelled: its
-      plane is subtracted (`table_plane.find_table`). What is then below the table gets height 0.
+      plane is subtracted (`table_plane.find_table`). Points below the levelled table get height 0.
     - A pixel is `in_view` if it is in some camera's image at the height `z_min`.
     - A camera's samples can be farther apart than grid pixels. An unseen pixel is interpolated if
       both of its neighbours along x or along y are seen, with heights within SAME_SURFACE of each
@@ -64,7 +64,7 @@ class HeightmapProjector(LeafSystem):
         """
         Args:
             cameras: the depth camera of each sensor by name, as passed to `RgbdSensor`.
-            grid: the pixels of the heightmap.
+            grid: the pixels of the heightmap; None for the default grid.
 
         Raises:
             ValueError: there is no camera.
@@ -110,7 +110,7 @@ class HeightmapProjector(LeafSystem):
         output.set_value(project(views, self._grid))
 
     def _EvalImage(self, context: Context, port: str, rays: DepthRays) -> NDArray:
-        """The image's data, (height, width, channels)."""
+        """The image (height, width, channels) of an input port."""
         image: Any = self.GetInputPort(port).Eval(context)
         data = np.asarray(image.data)
         height, width = rays.shape

@@ -6,32 +6,35 @@ from dataclasses import dataclass
 from systems.bounds import bounded
 
 _YAWS = (0.5, -0.5, 1.0, -1.0, 0.0)
-"""The yaw offsets that the search tries in this order, as fractions of its amplitude."""
+"""The yaw offsets that the search tries first, in order, as fractions of `amplitude`."""
 _GOLDEN = math.pi * (3 - math.sqrt(5))
 _SPIRAL = tuple(
     (math.sqrt(n / 16) * math.cos(n * _GOLDEN), math.sqrt(n / 16) * math.sin(n * _GOLDEN))
     for n in range(1, 17)
 )
-"""The position offsets that follow, an even spiral from the middle, as fractions of the reach."""
+"""The position offsets (x, y) that the search tries next, an even spiral from the middle, as
+fractions of `reach`."""
 _LEAST_RIM = 0.004
-"""Least height of a cavity's rim above the table, in metres; above the noise of o_t."""
+"""Least height of a cavity's rim above the table, in metres. It exceeds the noise of o_t."""
 _BACK = (0.0, 0.0)
 """The last offset returns to the start."""
 
 
 @dataclass
 class InsertionSearch:
-    """Parameters of the search: the hand presses lightly, rotates to and fro, then follows a
-    spiral, until the resistance ends."""
+    """Parameters of the search. The hand presses lightly, rotates to and fro, and then follows a
+    spiral, until the object slips into the cavity."""
 
-    # Amplitude of the yaw oscillation, in rad: undoes a small rotation of the tool by the closing
-    # jaws. Zero disables it; if `reach` is zero too, the object is released without a search.
+    # Amplitude of the yaw oscillation, in rad. The oscillation undoes a small rotation of the tool
+    # by the closing jaws. Zero disables it; if `reach` is zero as well, the object is released
+    # without a search.
     amplitude: float = bounded(0.12, 0.0, 0.5)
 
-    # Radius of the spiral, in m: about the calibration error. Zero disables the spiral.
+    # Radius of the spiral, in m, about as large as the calibration error. Zero disables the spiral.
     reach: float = bounded(0.004, 0.0, 0.02)
 
-    # Rotation speed, in rad/s: slow enough not to miss a clearance of about 3 degrees.
+    # Rotation speed, in rad/s. It is slow enough for the object to slip in where the clearance is
+    # about 3 degrees.
     yaw_speed: float = bounded(0.3, 0.01, 2.5)
 
     # Speed along the spiral, in m/s.
@@ -51,7 +54,7 @@ class InsertionSearch:
         return (len(_YAWS) if self.amplitude > 0 else 0) + spiral
 
     def offset(self, step: int) -> tuple[float, float, float]:
-        """Offset from the place at a step: x, y in m and yaw in rad."""
+        """Offset from the place at a step of the search: x and y in m, yaw in rad."""
         if self.amplitude > 0:
             if step < len(_YAWS):
                 return 0.0, 0.0, _YAWS[step] * self.amplitude
@@ -64,8 +67,8 @@ class InsertionSearch:
 
         Args:
             bottom: height of the object's bottom, in metres.
-            rim: highest surface around its place, in metres. If it is at table height, there is no
-                cavity.
+            rim: height of the highest surface around its place, in metres. If that is about the
+                table's height, there is no cavity.
             table: height of the table, in metres.
         """
         return rim > table + _LEAST_RIM and bottom > rim - self.rim_margin

@@ -1,4 +1,4 @@
-"""Opening and closing force of the jaws in each mode of the motion primitive."""
+"""Computes the opening and the closing force of the jaws in each mode of the motion primitive."""
 
 import math
 
@@ -11,28 +11,29 @@ class JawMotion:
     """Jaw openings and closing forces of all modes, as functions of the state."""
 
     settles = math.inf
-    """See `RobotMotion`: `tare_settle` says how long."""
+    """See `RobotMotion`; infinite, because the parameter `tare_settle` sets this time."""
 
     def __init__(self, parameters: PickPlaceParameters) -> None:
         """
         Args:
-            parameters: openings, speeds, forces.
+            parameters: openings, speeds and forces of the motion primitive.
         """
         self._parameters = parameters
 
     def open(self, state: PlannerState) -> None:
-        """Sets open jaws without force."""
+        """Sets the state to fully open jaws without closing force."""
         state.start_opening = state.goal_opening = self._parameters.open_width
         state.force_start_time = -self._parameters.force_ramp
 
     def wide(self, state: PlannerState) -> float:
-        """The opening before a grasp, in m."""
+        """The opening of the jaws before a grasp, in m."""
         return self._parameters.open_width
 
     def begin_jaws(
         self, state: PlannerState, mode: Mode, time: float, opening: float | None
     ) -> None:
-        """Starts opening and force of a mode, while the state is still that of the previous mode.
+        """Starts the jaws' motion and force for a new mode. Call it before the state's mode
+        changes.
 
         Args:
             state: the planner's state; modified.
@@ -58,13 +59,13 @@ class JawMotion:
             self.set_force(state, time, 0.0)
 
     def set_force(self, state: PlannerState, time: float, force: float) -> None:
-        """Ramps the closing force from its present value to another."""
+        """Ramps the closing force from its present value to `force`, in N."""
         if force != state.goal_force:
             state.start_force = self.force_at(state, time)
             state.goal_force, state.force_start_time = force, time
 
     def opening_at(self, state: PlannerState, time: float) -> tuple[float, float]:
-        """The opening between the pads in m, and its rate."""
+        """The opening between the pads in m, and its rate in m/s."""
         return ramp(
             state.start_opening,
             state.goal_opening,
@@ -81,7 +82,8 @@ class JawMotion:
         return float(state.start_force + fraction * (state.goal_force - state.start_force))
 
     def jaws_arrival(self, state: PlannerState, moved: float) -> float:
-        """When jaws and force of the present mode have arrived, but not before `moved`, in s."""
+        """The time, in s, at which the jaws' motion and force of the present mode are complete, or
+        `moved` if that is later."""
         opening_time = abs(state.goal_opening - state.start_opening) / (
             2 * self._parameters.finger_speed
         )

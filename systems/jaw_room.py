@@ -1,4 +1,4 @@
-"""How wide an object is between the jaws, from o_t."""
+"""Measures the width of an object between the jaws from o_t."""
 
 from __future__ import annotations
 
@@ -11,23 +11,26 @@ from systems.hand_geometry import FINGER_LENGTH, FINGERTIP_DEPTH, MAX_OPENING
 from systems.signals import PixelGrid, PlanarPose
 
 _LEVEL = 0.3
-"""The width is measured at this share of the object's height, below where the pads grip."""
+"""The width is measured at this share of the object's height, which is below where the pads
+grip."""
 _ROOM = 0.005
-"""The room beside the object that must be free, too, in m."""
+"""Clearance between object and finger that must also be free, in m."""
 _LINES = 7
-"""How many lines across the jaws are looked at."""
+"""Number of lines across the pads along which the width is measured."""
 
 
 def object_width(
     height: NDArray[np.float32], grid: PixelGrid, pick: PlanarPose, support: float, top: float
 ) -> float:
-    """Twice the distance from the pick to the farther side of the object, along the jaws.
+    """Measures twice the distance from the pick to the farther side of the object, in the direction
+    in which the jaws close.
 
     Args:
         height: (rows, cols) above the bottom of the grid, in m.
-        grid: of the heights.
-        pick: pose of the hand; the jaws close along its y.
-        support: height of the object's support, in m; likewise its `top`.
+        grid: pixel grid of the heights.
+        pick: pose of the hand in the world; the jaws close along its y axis.
+        support: height of the surface on which the object stands, in m.
+        top: height of the object's top at the pick, in m.
 
     Returns:
         The width in m. Infinite if the object is not seen at the pick, is wider than open jaws, or
@@ -48,7 +51,7 @@ def object_width(
     if not high[0] or high.all():
         return math.inf
     side = int(np.argmin(high))
-    # The fingers stand beside it.
+    # The area in which the fingers stand beside the object.
     reach = half[side] + _ROOM + FINGERTIP_DEPTH
     if reach > farthest or high[side:][half[side:] < reach].any():
         return math.inf

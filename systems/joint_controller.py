@@ -18,13 +18,14 @@ from systems.arm_limits import JOINTS
 from systems.trajectory_controller import FINGERS, FingerLaw
 
 _FOLLOWS = 0.05
-"""Time constant with which the compensated load follows the payload, in s."""
+"""Time constant with which the compensated load f follows the port `payload`, in s."""
 _EQUAL = 1e-3
-"""In N."""
+"""Loads that differ by less than this count as equal, in N."""
 
 
 class JointController(LeafSystem):
-    r"""Joint impedance with computed torque, as libfranka offers it, and the fingers' force.
+    r"""Computes joint impedance control with computed torque, as libfranka offers it, and the
+    fingers' force.
 
     .. pydrake_system::
 
@@ -41,10 +42,12 @@ class JointController(LeafSystem):
         - finger_force
 
     - `robot_state` (18): positions of the seven joints and both fingers, then their velocities.
-    - `desired_motion` (21): q_d, v_d, a_d of the joints, in rad and s.
+    - `desired_motion` (21): positions q_d, velocities v_d and accelerations a_d of the joints, in
+      rad and s.
     - `desired_opening` (2), `closing_force` (1): as in `TrajectoryController`.
-    - `payload` (1): the vertical force of what the hand holds, as it was weighed, in N; negative.
-    - `desired_state` (14): q_n, v_n, for the plant's port of that name.
+    - `payload` (1): the vertical force of the held object on the hand, as the planner has weighed
+      it, in N; it is negative, and zero for an empty hand.
+    - `desired_state` (14): positions q_n and velocities v_n, for the plant's port `desired_state`.
     - `feedforward` (7): u_ff, for the plant's actuation port, in N m.
     - `finger_force` (2): actuation of the fingers, in N.
 
@@ -60,21 +63,21 @@ class JointController(LeafSystem):
     with which the plant's integration, q + h v, gets there.
 
     The model's gravity is not compensated here: a Franka compensates its own weight, so the plant's
-    arm has no gravity. Its payload it compensates once it is told, as by libfranka's `setLoad`: f
+    arm has no gravity. The weight of a payload must be set, as with libfranka's `setLoad`: f
     follows `payload` smoothly. J_z is the Jacobian of the fingertips' height.
 
     The fingers follow the `FingerLaw`.
 
-    State (discrete): f.
+    State (discrete): the load f, in N.
     """
 
     def __init__(self, *, arm: MultibodyPlant, step: float, fingers: FingerLaw) -> None:
         """
         Args:
-            arm: a plant of nothing but the arm and its hand, without gravity; the joints come
+            arm: a plant that contains only the arm and its hand, without gravity; the joints come
                 before the fingers.
             step: h, the time step of the plant that is controlled, in s.
-            fingers: the law of the fingers.
+            fingers: the control law of the fingers.
 
         Raises:
             ValueError: the plant does not have seven joints and two fingers.
@@ -83,7 +86,7 @@ class JointController(LeafSystem):
         if arm.num_positions() != JOINTS + FINGERS:
             raise ValueError(f"arm must have 9 positions, not {arm.num_positions()}")
         self._arm, self._step, self._fingers = arm, step, fingers
-        # Scratch memory: no value outlives the call that sets it.
+        # Scratch memory: each call overwrites the values before it reads them.
         self._scratch, self._no_forces = arm.CreateDefaultContext(), MultibodyForces(arm)
         joints, size = JOINTS, JOINTS + FINGERS
         self._load_index = self.DeclareDiscreteState(1)
@@ -134,7 +137,8 @@ class JointController(LeafSystem):
         torque = arm.CalcInverseDynamics(scratch, wanted, self._no_forces)[:JOINTS]
         load = context.get_discrete_state(self._load_index).value()[0]
         if load:
-            # Heights in the base are those in the world but for a constant.
+            # Heights in the base's frame and in the world differ by a constant, so their Jacobians
+            # are equal.
             torque = torque - load * jacobian(arm.GetPositions(scratch)[:JOINTS])[5]
         output.SetFromVector(torque)
 

@@ -1,4 +1,5 @@
-"""The edges of a block, over which an object that lies the wrong way up is turned."""
+"""Finds poses at which an object that lies upside down tips over the edge of a block and turns
+over."""
 
 from __future__ import annotations
 
@@ -11,29 +12,30 @@ from numpy.typing import NDArray
 from systems.signals import PlanarPose
 
 _OUTSIDE = (0.15, 0.6)
-"""The centre of mass is let go outside the edge, by a share in this range of what is inside."""
+"""An object is released with its centre of mass outside the edge. The distance outside is a share,
+in this range, of the part of the object that lies on the block."""
 _MOST_OUTSIDE = 0.008
-"""Greatest distance outside, in metres."""
+"""Largest distance of the centre of mass outside the edge, in metres."""
 _BESIDE = 0.005
-"""The object must lie on the block on both sides of its centre of mass, at least so far from it
+"""The object must rest on the block on both sides of its centre of mass, at least this far from it
 along the edge, in metres."""
 _FROM_CORNER = 0.02
-"""Its distance from the block's corner along the edge, in metres. The object reaches beyond the
-corner, where the hand can grip it again."""
+"""Distance of the centre of mass from the block's corner along the edge, in metres. The object then
+reaches beyond the corner, where the hand can grip it again."""
 _LANDING = 0.09
-"""Width of the part of the table on which it lands, in metres."""
+"""Width of the part of the table that must be free for the object to land on, in metres."""
 _ROOM = 0.015
-"""Room beyond the object's ends there, in metres."""
+"""Free space required beyond the object's ends where it lands, in metres."""
 
 
 @dataclass(frozen=True)
 class Ledge:
-    """A block on the table."""
+    """A block on the table over whose edges objects can be turned."""
 
     pose: PlanarPose
-    """Its middle and its heading in the world."""
+    """The block's middle and heading in the world."""
     size: tuple[float, float]
-    """Extents along its heading and across it, in metres."""
+    """Extents of the block along its heading and across it, in metres."""
 
     def turning_pose(
         self,
@@ -44,24 +46,27 @@ class Ledge:
         *,
         inner_side: int = 0,
     ) -> PlanarPose | None:
-        """Where to let go of an object so that it tips over an edge and turns over.
+        """Finds where to release an object so that it tips over an edge and turns over.
 
         Args:
-            outline: (k, 2) points of the object as it is held, from its centre of mass, along its
-                heading and to the left of it, in metres.
-            p_WCenter: its centre of mass, which picks the share outside and the edge: after a
-                failure, the object lies elsewhere, and is let go differently.
+            outline: (k, 2) points of the held object relative to its centre of mass, first along
+                its heading and then to the left of it, in metres.
+            p_WCenter: the object's centre of mass in the world, in metres. It determines the edge
+                and the share outside, so that after a failure, when the object lies elsewhere,
+                another try differs.
             others: (m, 3) points of everything that may be in the way, in the world.
-            area: where the object may land: lower and upper (x, y) corner.
-            inner_side: which side lies on the block: 1 the left, -1 the right, 0 the wider one.
+            area: lower and upper (x, y) corners of the area in which the object may land.
+            inner_side: the side of the object that rests on the block: 1 for the left one, -1 for
+                the right one, 0 for the wider one.
 
         Returns:
-            The point of its centre of mass and its heading; None if all edges are obstructed.
+            The position of the object's centre of mass and its heading; None if all edges are
+            obstructed.
         """
         low, high = np.array(area[0]), np.array(area[1])
         middle = np.array([self.pose.x, self.pose.y])
         length = float(np.ptp(outline[:, 0]))
-        # Its left side, or after half a turn its right side, lies on the block.
+        # Either the left side rests on the block or, after half a turn, the right side.
         left, right = _inside(outline), _inside(-outline)
         options = {1: (left, 0.0), -1: (right, math.pi)}
         inside, half_turn = options.get(inner_side, max(options.values()))
@@ -87,7 +92,7 @@ class Ledge:
                 delta = others[:, :2] - edge
                 u, v = delta @ along, delta @ normal
                 count = int(((np.abs(u) < length / 2 + _ROOM) & (v > -0.05) & (v < _LANDING)).sum())
-                # Beside this edge, the object has been let go before.
+                # The object lies beside this edge, so it was probably released here before.
                 again = bool(np.linalg.norm(p_WCenter[:2] - edge) < _LANDING)
                 if best is None or (count, again) < best[0]:
                     p_W = edge + outside * normal
@@ -97,7 +102,8 @@ class Ledge:
 
 
 def _inside(outline: NDArray[np.float64]) -> float:
-    """How far an object reaches to the left on both sides of its centre of mass, in metres."""
+    """How far an object reaches to the left of its centre of mass, in metres: the smaller of the
+    values before and behind it."""
     u, v = outline.T
     reach = u.max() - u.min()
     sides = [(sign * u > _BESIDE) & (sign * u < 0.3 * reach) for sign in (-1, 1)]
@@ -107,13 +113,13 @@ def _inside(outline: NDArray[np.float64]) -> float:
 def moved_gripper(
     gripper: PlanarPose, p_WHeld: NDArray[np.float64], yaw: float, goal: PlanarPose
 ) -> PlanarPose:
-    """The gripper's pose after it has carried an object.
+    """The gripper's pose after it has carried an object to a goal.
 
     Args:
-        gripper: its pose before.
-        p_WHeld: a point of the object before.
+        gripper: the gripper's pose before.
+        p_WHeld: position of a point of the object before, in the world.
         yaw: the object's heading before, in radians.
-        goal: the point and the heading afterwards.
+        goal: position of the same point, and heading of the object, afterwards.
     """
     turn = goal.theta - yaw
     dx, dy = gripper.x - p_WHeld[0], gripper.y - p_WHeld[1]

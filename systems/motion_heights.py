@@ -21,15 +21,15 @@ class MotionHeights:
     pick_hover: float
     """Height above the pick down to which the hand moves fast."""
     place_hover: float
-    """The same above the place, with the held object."""
+    """Height above the place down to which the hand moves fast with the held object."""
 
 
 def motion_heights(heights: SurfaceHeights, parameters: PickPlaceParameters) -> MotionHeights:
     """Computes the heights of a motion.
 
-    The fingertips grip below the object's top by a share of its height, within limits, and stay
-    above the table. The object's bottom hangs as far below the fingertips as they were above its
-    support at the pick.
+    The fingertips grip a share of the object's height below its top, within limits, and stay above
+    the table. The object's bottom hangs as far below the fingertips as its support was below them
+    at the pick.
 
     Args:
         heights: the heights of the surfaces, as `read_surface_heights` returns them.

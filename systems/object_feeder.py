@@ -18,7 +18,7 @@ _STILL_THERE = 1.0
 
 
 class ObjectFeeder(LeafSystem):
-    """Chooses the object to appear next, when the area in which objects appear is clear.
+    """Chooses the object that appears next when the area in which objects appear is clear.
 
     .. pydrake_system::
 
@@ -33,8 +33,8 @@ class ObjectFeeder(LeafSystem):
     - `mode` (1): the planner's port of that name.
     - `arriving` (1): the index in `waiting` of the object to appear now, or -1.
 
-    The law: while the hand retreats or observes, and no object's origin is over `area`, the first
-    waiting object is to appear. The station then moves the body. Stateless.
+    The law: if the hand retreats or observes, and no object's origin is over `area`, the first
+    object that still waits is the one to appear. The station then moves the body. Stateless.
     """
 
     def __init__(
@@ -46,9 +46,11 @@ class ObjectFeeder(LeafSystem):
     ) -> None:
         """
         Args:
-            waiting: the bodies that appear, in order, and each one's waiting position p_WB (3,).
+            waiting: the bodies that appear, in order, and the position p_WB (3,) at which each one
+                waits.
             others: the bodies that are present from the beginning.
-            area: lower and upper (x, y) corner in the world, in metres.
+            area: lower and upper (x, y) corners, in the world and in metres, of the area in which
+                objects appear.
         """
         super().__init__()
         self._waiting = [(int(body), p_WWait) for body, p_WWait in waiting]

@@ -33,7 +33,7 @@ from systems.signals import PickPlaceAction, PlanarPose, SurfaceHeights, wrap_to
 from systems.weak_calc import weak_calc
 
 _NEAR_GOAL = 0.03
-"""An object within this distance of its goal's pose is near it, in metres."""
+"""An object within this distance of a goal's pose counts as near it, in metres."""
 _SAME_HEIGHT = 0.005
 """Objects within this height difference are equally high, in metres."""
 
@@ -45,8 +45,9 @@ def gripper_pose(
 
     Args:
         X_WB: the object's pose.
-        grasp: the grasp, in B.
-        height: z in B of the point of a tilted object that is above the grasp, in metres.
+        grasp: the grasp in the object's frame B.
+        height: z in B, in metres, of the point of a tilted object whose (x, y) in the world the
+            gripper takes.
     """
     yaw = heading(X_WB)
     x, y, _ = X_WB @ np.array([grasp.x, grasp.y, height])
@@ -66,7 +67,7 @@ def grasp_taken(X_WB: RigidTransform, gripper: PlanarPose) -> PlanarPose:
 
 @dataclass(frozen=True)
 class _Plan:
-    """An object, a grasp of it, and its goal pose."""
+    """The next move: an object, a grasp of it, and its goal pose."""
 
     index: int
     grasp: Grasp
@@ -90,33 +91,34 @@ class OraclePolicy(LeafSystem):
         - action
 
     - `body_poses` (abstract, list of RigidTransform by body index): the plant's port of that name.
-    - `kept_goals` (one for each goal): the `PlacementMonitor`'s port of that name. If it is not
-      connected, no goal is kept.
-    - `failed_picks` (abstract, a tuple of `PlanarPose`): the planner's port of that name. Used only
-      where objects lie on each other; optional.
+    - `kept_goals` (one element for each goal): the `PlacementMonitor`'s port of that name, which
+      marks goals that count as filled for good. If it is not connected, no goal is kept.
+    - `failed_picks` (abstract, a tuple of `PlanarPose`): the planner's port of that name. It is
+      optional, and used only if objects may lie on each other.
     - `mode` (1) and `accepted_action` (abstract, `PickPlaceAction`): the planner's ports of those
-      names, by which the oracle remembers what it tried (see `AttemptMemory`).
+      names, from which the oracle counts its attempts (see `AttemptMemory`).
     - `action` (abstract, `PickPlaceAction`): moves an object to a goal; `stop` when every goal is
       filled.
 
     The law chooses, in this order:
 
-    1. The goal: the first that is not filled and whose prerequisites are filled or kept. Goals
-       that already have a misplaced object come last. An object that was tried already comes after
-       the others, so that a tool that slips does not cost the others their actions.
-    2. The object: the highest one in the cell that may fill the goal and fills no other, since
-       nothing lies on it. Of equally high ones, the one that `evaluate_placements` assigned.
-    3. The goal pose: the free one that rotates the object least.
+    1. The goal: the first that is not filled and whose prerequisites are filled or kept. Goals that
+       already have a misplaced object come last. Objects that were tried before come after the
+       others, so that a tool that slips does not use up all actions.
+    2. The object: of those that may fill the goal and fill no other, the highest one, since nothing
+       lies on it. Of equally high ones, the one that `evaluate_placements` assigned.
+    3. The goal pose: of the goal's unoccupied poses, the one that rotates the object least.
     4. The grasp: the first that keeps the fingers clear of other objects at the pick and the place.
-       Of those, one that was tried least often: after a slip, the next.
+       Of these, the one that was tried least often, so that the next one follows after a slip.
 
     With a quantizer, the action is the best that a policy of the paper can choose. The pick is the
     rounded annotated grasp. The place is the gripper pose that brings the object, held by the
-    *rounded* pick, to its goal. Its position and the rotation are then rounded, too. A place
-    network whose crop is centred on the pick needs these labels (section III-C.2).
+    *rounded* pick, to its goal. Position and rotation of the place are then rounded as well. A
+    place network whose crop is centred on the pick needs these labels (section III-C.2).
 
-    Where objects touch or lie on each other (`table`), `ClutterExpert` chooses the object and the
-    grasp, and lays aside what is in the way. Its actions are not rounded and carry heights.
+    If objects may touch or lie on each other (`table` is given), `ClutterExpert` chooses the object
+    and the grasp, and lays aside objects that are in the way. Its actions are not rounded, and
+    carry heights.
 
     State: the number of attempts by object and grasp.
     """
@@ -137,16 +139,18 @@ class OraclePolicy(LeafSystem):
     ) -> None:
         """
         Args:
-            objects: n of them.
-            grasps: n, the grasps of each object, best first; empty if it can fill no goal.
-            goals: in the order in which to fill them.
+            objects: the n objects.
+            grasps: for each of the n objects, its grasps, best first; empty for an object that can
+                fill no goal.
+            goals: the goals, in the order in which to fill them.
             success: decides when a goal is filled.
             quantizer: rounds the actions; None leaves them exact.
             tip_depth: how far below an object's top the fingertips reach, in m.
             release_clearance: how far each jaw opens to release an object, in m.
             open_width: opening of the jaws before a grasp, in m.
-            brings_heights: whether actions carry heights; else the planner reads them off o_t.
-            table: where objects may lie on each other; None: they lie apart.
+            brings_heights: whether actions carry surface heights; if not, the planner reads them
+                off o_t.
+            table: the table, if objects may lie on each other; None if they lie apart.
 
         Raises:
             ValueError: there are no goals, or an object of a goal has no grasp.
@@ -229,9 +233,14 @@ class OraclePolicy(LeafSystem):
         kept: frozenset[int],
         tried: NDArray[np.float64] | None = None,
     ) -> list[int]:
-        """The goals that may be filled now, those with a misplaced object last.
+        """Indices of the goals that may be filled now. Goals with a misplaced object come last; of
+        the others, those come first whose objects were tried least often.
 
-        Otherwise those come first whose objects were tried least often; `tried` is (n,).
+        Args:
+            poses: X_WB of each of the n objects.
+            placements: the present placement of each object.
+            kept: indices of goals that count as filled.
+            tried: (n,) how often each object was tried; None: not at all.
         """
         filled = kept | {item.goal for item in placements if item.success}
         failed_there = {
@@ -260,7 +269,7 @@ class OraclePolicy(LeafSystem):
         kept: frozenset[int],
         failed: Sequence[PlanarPose],
     ) -> PickPlaceAction | None:
-        """The next action where objects lie on each other; None if nothing is left to do."""
+        """The next action if objects may lie on each other; None if nothing is left to do."""
         clutter = ClutterExpert(table, poses, failed)
         options = [
             (item, goal)
@@ -365,7 +374,8 @@ class OraclePolicy(LeafSystem):
         if quantizer is not None:
             pick = PlanarPose(*quantizer.position(pick.x, pick.y), quantizer.angle(pick.theta))
             held = grasp_taken(X_WB, pick)
-        # A level object that is let into a tilted cavity meets it halfway up.
+        # A level object that is lowered into a tilted cavity touches its floor under half of its
+        # height.
         height = plan.grasp.surface_height / 2 if is_tilted(plan.X_WGoal) else 0.0
         place = gripper_pose(plan.X_WGoal, held, height)
         theta = wrap_to_pi(pick.theta)
@@ -402,13 +412,13 @@ class OraclePolicy(LeafSystem):
 def _count_within_fingers(
     points: NDArray[np.float64], gripper: PlanarPose, tip: float, reach: tuple[float, float]
 ) -> int:
-    """How many points lie within the volume of the fingers.
+    """Counts the points that lie within the volume of the fingers.
 
     Args:
         points: (m, 3) in the world, in metres.
-        gripper: the gripper's pose.
+        gripper: the gripper's pose in the world.
         tip: world z of the fingertips, in metres.
-        reach: nearest and farthest extent of a finger from the gripper's middle, in metres.
+        reach: distances of a finger's inner and outer side from the gripper's middle, in metres.
     """
     cos, sin = math.cos(gripper.theta), math.sin(gripper.theta)
     dx, dy = points[:, 0] - gripper.x, points[:, 1] - gripper.y

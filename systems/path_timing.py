@@ -1,4 +1,4 @@
-r"""Moves along a path in joint space, as fast as the joints' limits allow.
+r"""Computes motions along a path in joint space that are as fast as the joints' limits allow.
 
 `fastest_times` solves the time-optimal path parameterization by the reachability analysis of Pham
 and Pham, "A new approach to time-optimal path parameterization based on reachability analysis",
@@ -7,8 +7,8 @@ and u. One pass backwards finds the largest x from which the end can be reached,
 takes the largest u.
 
 `SmoothMotion` averages such a motion over the last few milliseconds. This limits the jerk. All
-other limits still hold, because they are convex: an average of states within limits of position
-and acceleration, and of velocity limits that are concave in the position, is within them, too.
+other limits still hold, because they are convex: if states are within limits of position and
+acceleration, and within velocity limits that are concave in the position, so is their average.
 """
 
 from __future__ import annotations
@@ -26,36 +26,41 @@ from systems.arm_limits import ArmLimits
 TICK = 1 / 1024
 """Time between the samples of a motion, in s."""
 AVERAGED, _MOST_AVERAGED = 6, 80
-"""Number of ticks over which the acceleration is averaged: at least, at most."""
+"""Least and largest number of ticks over which the acceleration is averaged."""
 _SHARE = 0.98
-"""Share of the limits that a motion uses. Between the path's points it takes a little more."""
+"""Share of the limits that a motion uses at the path's points. Between them it uses a little
+more."""
 _RATE_SHARE = 0.9
-"""Likewise of the limits of the torques' rates: the model of the inertia is not exact."""
+"""Share of the limits of the torques' rates that a motion uses. It is smaller, because the model of
+the inertia is not exact."""
 _LEAST, _UNLIMITED = 1e-9, 1e12
 
 
 @dataclass(frozen=True)
 class RowLimits:
-    """Limits along a path: of its joints, and of other quantities that depend on them."""
+    """Limits along a path. A row is a joint's position, or another quantity that depends on the
+    joints."""
 
     low: NDArray[np.float64]
-    """(n, rows) lowest velocities at the path's points; negative. Likewise `high`."""
+    """(n, rows) lowest velocities at the path's points, negative. `high` holds the highest
+    velocities."""
     high: NDArray[np.float64]
     acceleration: NDArray[np.float64]
-    """(rows) largest accelerations; finite."""
+    """(rows) largest accelerations; all must be finite."""
 
 
 def fastest_times(
     points: NDArray[np.float64], limits: RowLimits
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """When, and how fast, to pass the points of a path, from rest to rest.
+    """The times at which to pass the points of a path, and the speeds there, from rest to rest.
 
     Args:
-        points: (n, rows) at least 3, evenly spaced in the path's parameter.
-        limits: of each row.
+        points: (n, rows) at least 3 points, evenly spaced in the path's parameter.
+        limits: limits of each row.
 
     Returns:
-        (n) times in s, from zero, and (n) rates ds/dt, where s counts the points.
+        (n) times since the start, in s, and (n) rates ds/dt, where the parameter s is the index of
+        the point.
     """
     spline = CubicSpline(np.arange(len(points)), points)
     slopes = spline.c[2]
@@ -85,7 +90,7 @@ def _solvable(b: NDArray[np.float64], k: NDArray[np.float64]) -> NDArray[np.floa
 def _largest(
     highest: list[float], b: NDArray[np.float64], k: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """(n) the profile x, by one pass backwards and one forwards."""
+    """(n) the largest x = (ds/dt)^2 at each point, from one pass backwards and one forwards."""
     # Before a point with x at most e, x (1 - 2 k) must be at most e + 2 b in each row.
     with np.errstate(divide="ignore"):
         gain = np.where(1 - 2 * k > 0, 1 / (1 - 2 * k), _UNLIMITED)
@@ -123,12 +128,13 @@ class SmoothMotion:
         moved = velocity[:-1] * TICK + (2 * acceleration[:-1] + acceleration[1:]) * (TICK**2 / 6)
         place = np.concatenate([position[:1], position[:1] + np.cumsum(moved, axis=0)])
         self.samples = np.hstack([place, velocity, acceleration])
-        """(n, 3 joints) position, velocity, acceleration."""
+        """(n, 3 * joints) positions, velocities and accelerations at every tick."""
         self.goal = position[-1]
         self.duration = (len(self.samples) - 1) * TICK
 
     def at(self, time: float) -> NDArray[np.float64]:
-        """(3 joints) position, velocity and acceleration; at rest before and after the motion."""
+        """(3 * joints) positions, velocities and accelerations at a time in s. The joints are at
+        rest before and after the motion."""
         if time <= 0:
             return self._rest(self.samples[0, : len(self.goal)])
         if time >= self.duration:
@@ -146,7 +152,8 @@ class SmoothMotion:
         return np.concatenate([position, np.zeros(2 * len(position))])
 
     def excess(self, limits: ArmLimits) -> float:
-        """By which factor the motion must be slower to stay within the limits; 1 if it is."""
+        """The factor by which the motion must be slowed down to stay within the limits; 1 if it
+        stays within."""
         q, v, a = np.split(self.samples, 3, axis=1)
         low, high = braking_bounds(limits, q)
         speed = np.maximum(v / np.maximum(high, _LEAST), v / np.minimum(low, -_LEAST))
@@ -155,7 +162,7 @@ class SmoothMotion:
         return max(1.0, speed.max(), math.sqrt(change.max()), float(np.cbrt(jerk.max())))
 
     def torque_rate(self, limits: ArmLimits, inertia: ArmInertia) -> float:
-        """The largest rate of a torque, as a share of what a motion may use."""
+        """The largest rate of a joint's torque, as a share of the rate that a motion may use."""
         q, _, a = np.split(self.samples, 3, axis=1)
         rates = np.abs(np.diff(inertia.torques(q, a), axis=0)) / TICK
         return float((rates / limits.torque_rate).max()) / _RATE_SHARE
@@ -164,9 +171,10 @@ class SmoothMotion:
 def braking_bounds(
     limits: ArmLimits, q: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """As `ArmLimits.velocity_bounds`, and never so fast that a joint cannot stop in its range."""
+    """Like `ArmLimits.velocity_bounds`, but so slow near the end of a range that the joint can stop
+    before it."""
     low, high = limits.velocity_bounds(q)
-    # Half of the acceleration: a stop begins with a little jerk.
+    # Assume half of the limit of acceleration, because limited jerk delays the braking.
     brakes = np.array(limits.acceleration)
     return (
         np.maximum(low, -np.sqrt(np.maximum(brakes * (q - limits.lower), 0.0))),
@@ -185,10 +193,10 @@ def plan_motion(
 
     Args:
         points: (n, 7) joint positions, evenly spaced in the path's parameter, at least 3.
-        limits: of the joints; they hold exactly.
+        limits: limits of the joints; they hold exactly.
         extra: (n, rows) other quantities that are limited along the path, such as a height.
-        bounds: limits of these rows, which hold up to a few percent.
-        inertia: of the arm; None: the rates of the torques are not limited.
+        bounds: limits of the rows of `extra`; a motion may exceed them by a few percent.
+        inertia: model of the arm's inertia; None: the rates of the torques are not limited.
     """
     low, high = braking_bounds(limits, points)
     rows = RowLimits(

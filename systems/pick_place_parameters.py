@@ -12,7 +12,7 @@ class Mode(enum.IntEnum):
     """The planner's modes. A successful pick and place passes through them in order, up to DONE."""
 
     OBSERVE = 0
-    """Wait out of the cameras' sight, then query the policy."""
+    """Wait where the hand does not hide the table from the cameras, then query the policy."""
     APPROACH = 1
     """Move above the pick and open the jaws."""
     DESCEND = 2
@@ -32,28 +32,29 @@ class Mode(enum.IntEnum):
     """Rise and move out of the cameras' sight."""
     DONE = 10
     SEARCH = 11
-    """Insertion is blocked: search for the cavity, see `InsertionSearch`."""
+    """Search for the cavity after a blocked insertion; see `InsertionSearch`."""
 
 
 @dataclass
 class PickPlaceParameters:
     """Heights, speeds and thresholds of the motion primitive."""
 
-    # The hand's home: x, y, height of the fingertips (m), yaw (rad). It starts there; afterwards it
-    # returns to this x and height, keeping its y and yaw. It must be out of the cameras' sight: the
-    # default suits the three default cameras. For an overhead camera choose, e.g.,
-    # [-0.4, 0, 0.4, 0].
+    # The hand's home: x, y, height of the fingertips (m), yaw (rad). The hand starts there; after
+    # each action it returns to this x and height and keeps its y and yaw. The home must be out of
+    # the cameras' sight. The default suits the three default cameras. For an overhead camera
+    # choose, e.g., [-0.4, 0, 0.4, 0].
     home: list[float] = bounded([0.5, 0.0, 0.4, 0.0], -2.0, 2.0)
 
     # Clearance of the fingertips or the held object above the highest surface of the heightmap o_t
     # while the hand crosses the table, in m.
     travel_clearance: float = bounded(0.015, 0.0, 0.1)
 
-    # The hand comes down fast to this far above the surfaces around its goal in o_t, in m.
+    # The hand moves fast until it is this far above the surfaces around its goal in o_t, in m.
     hover_clearance: float = bounded(0.010, 0.001, 0.1)
 
-    # Depth of the fingertips below the top of the grasped object, in m: a share of its height above
-    # its support, within limits. On a round handle the pads should be near its widest section.
+    # Depth of the fingertips below the top of the grasped object, in m. It is a share of the
+    # object's height above its support, within limits. On a round handle the pads should be near
+    # the widest section.
     grasp_depth: float = bounded(0.010, 0.001, 0.05)
     max_grasp_depth: float = bounded(0.018, 0.001, 0.05)
     grasp_depth_share: float = bounded(0.4, 0.0, 1.0)
@@ -70,10 +71,10 @@ class PickPlaceParameters:
     # Force of each pad on the held object, in N.
     grasp_force: float = bounded(30.0, 1.0, 140.0)
 
-    # The grip is firmer the more an object weighs, because one that is gripped beside its centre of
-    # mass turns between the pads: `firm_grasp_force` at `heavy_load`, `peak_grasp_force` at
-    # `heaviest_load`, all in N (see `grip_force`). A Franka Hand grips with 70 N continuously and
-    # with up to 140 N for a short time.
+    # The grip is firmer for heavier objects, because an object that is gripped away from its centre
+    # of mass may turn between the pads. The force is `firm_grasp_force` for a weight of
+    # `heavy_load` and `peak_grasp_force` for `heaviest_load`, all in N (see `grip_force`). A Franka
+    # Hand grips with 70 N continuously and with up to 140 N for a short time.
     firm_grasp_force: float = bounded(70.0, 1.0, 140.0)
     heavy_load: float = bounded(5.0, 0.5, 100.0)
     peak_grasp_force: float = bounded(140.0, 1.0, 140.0)
@@ -82,9 +83,9 @@ class PickPlaceParameters:
     # Below this width between the squeezing pads the grasp counts as empty, in m.
     minimum_width: float = bounded(0.0005, 0.0, 0.08)
 
-    # To seat an object that sticks out, closed jaws press it down with this force, in N, and go at
-    # most this far below its top, in m. They touch it at `touch_speed`; the force overshoots by
-    # about 5 N.
+    # Force in N with which closed jaws press down an object that sticks out of its cavity, and the
+    # largest depth, in m below the object's top, to which they go. They touch it at `touch_speed`;
+    # the force overshoots by about 5 N.
     press_force: float = bounded(30.0, 1.0, 140.0)
     press_depth: float = bounded(0.020, 0.001, 0.05)
 
@@ -92,7 +93,8 @@ class PickPlaceParameters:
     contact_threshold: float = bounded(4.0, 0.5, 100.0)
 
     # A contact force on the hand beyond this, in N, ends the action: the hand stops, lets go and
-    # rises. The vertical force without the payload counts, and the lateral one: `ContactGuard`.
+    # rises. `ContactGuard` compares the vertical force, without the payload's weight, and the
+    # lateral force.
     force_limit: float = bounded(30.0, 5.0, 140.0)
 
     # Highest linear speed (m/s) and acceleration (m/s^2) in free space, for (x, y) and z each. The
@@ -100,7 +102,7 @@ class PickPlaceParameters:
     linear_speed: float = bounded(1.2, 0.01, 1.2)
     linear_acceleration: float = bounded(8.0, 0.1, 9.0)
 
-    # The same with an object in the hand.
+    # Highest linear speed (m/s) and acceleration (m/s^2) with an object in the hand.
     carry_speed: float = bounded(1.2, 0.01, 1.2)
     carry_acceleration: float = bounded(5.0, 0.1, 9.0)
 
@@ -108,32 +110,34 @@ class PickPlaceParameters:
     yaw_speed: float = bounded(2.5, 0.01, 2.5)
     yaw_acceleration: float = bounded(20.0, 0.1, 25.0)
 
-    # Highest speeds of the guarded motions (DESCEND and LOWER), in m/s: above all surfaces near the
-    # goal, below them, where something may be touched, and where contact is expected. An impact's
-    # force is proportional to the speed: about 10 N at 0.015 m/s.
+    # Highest speeds in DESCEND and LOWER, in m/s: first above all surfaces near the goal, then
+    # below them, where a contact is possible, and last where contact is expected. The force of an
+    # impact is proportional to the speed: about 10 N at 0.015 m/s.
     descend_speed: float = bounded(0.20, 0.005, 1.0)
     lower_speed: float = bounded(0.20, 0.005, 1.0)
     contact_speed: float = bounded(0.05, 0.005, 1.0)
     touch_speed: float = bounded(0.015, 0.002, 1.0)
 
-    # The hand slows down this far above such a surface, in m, plus the doubt of its height.
+    # The hand slows down this far above the first possible and above the expected contact, in m,
+    # plus the uncertainty of the heights.
     slow_margin: float = bounded(0.001, 0.0, 0.02)
 
-    # The search when an insertion is blocked. Used only in tasks that insert.
+    # Parameters of the search after a blocked insertion. Used only in tasks that insert objects
+    # into cavities.
     search: InsertionSearch = field(default_factory=InsertionSearch)
 
     # Speed of one finger, in m/s.
     finger_speed: float = bounded(0.05, 0.005, 0.05)
 
-    # Time in which the grasp force builds up and decays, in s. It is short, because a heavy object
-    # that is released slowly swings about the pads.
+    # Time in which the grasp force builds up and decays, in s. Keep it short: a heavy object that
+    # is released slowly swings about the pads.
     force_ramp: float = bounded(0.03, 0.0, 5.0)
 
     # How long the hand rests before the cameras look and before the payload is tared, in s.
     observe_settle: float = bounded(0.10, 0.0, 10.0)
     tare_settle: float = bounded(0.10, 0.0, 10.0)
 
-    # The planner stops after this many actions; null: the task's number.
+    # The planner stops after this many actions; null stands for the task's own limit.
     max_actions: int | None = bounded(None, 0, 1000)
 
     def motion_limits(self) -> dict[Mode, MotionLimits]:

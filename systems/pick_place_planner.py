@@ -60,61 +60,70 @@ class PickPlacePlanner(LeafSystem):
         - accepted_action
 
     - `hand_state` (12): positions then velocities of (x, y, z, yaw, left finger, right finger).
-    - `hand_contact_force` (6): contact as generalized force on the same coordinates, in N and N m,
-      as force-torque sensors at the wrist and in each finger would measure it. Up is positive.
-    - `action` (abstract, `PickPlaceAction`): evaluated only when the planner, at rest out of the
-      cameras' sight, needs an action. Policy and cameras are not evaluated at other times.
-    - `observation` (abstract, `Observation`): o_t, evaluated together with the action if the
-      action carries no heights. They are then read off o_t.
+    - `hand_contact_force` (6): the generalized contact force on the same coordinates, in N and N m,
+      as force-torque sensors at the wrist and in each finger would measure it. A force upwards is
+      positive.
+    - `action` (abstract, `PickPlaceAction`): the next action. The port is evaluated only when the
+      hand rests out of the cameras' sight and the planner needs an action. Policy and cameras are
+      not evaluated at other times.
+    - `observation` (abstract, `Observation`): o_t. If the action carries no surface heights, this
+      port is evaluated together with it, and the heights are read off o_t.
     - `wrist_moment` (1): the moment of the contact forces about the hand's y axis, along which the
       jaws close, in N m, as a force-torque sensor at the wrist measures it while the hand moves
-      vertically. It is positive if a load hangs beyond +x of the hand. Evaluated in `LIFT` only.
-    - `desired_motion` (12): q_d, v_d, a_d of (x, y, z, yaw).
-    - `desired_opening` (2): the opening between the pads in m, and its rate.
+      vertically. It is positive for a load on the hand's +x side. It is evaluated in `LIFT` only.
+    - `desired_motion` (12): positions q_d, velocities v_d and accelerations a_d of (x, y, z, yaw),
+      in m, rad and s.
+    - `desired_opening` (2): the opening between the pads in m, and its rate in m/s.
     - `closing_force` (1): additional force of each pad, in N.
     - `mode` (1): a `Mode`.
-    - `counts` (4): actions begun, grasps missed, objects dropped, actions stopped by the guard.
-    - `failed_picks` (abstract, a tuple of `PlanarPose`): the last 16 picks where a grasp was missed
-      or lost, an object pressed down, or the action stopped, latest last. A policy can use it to
-      try another.
-    - `history` (abstract, a tuple of `Attempt`): the last 64 actions whose outcome is decided,
-      oldest first.
+    - `counts` (4): the numbers of actions begun, grasps missed, objects dropped, and actions
+      stopped by the force guard.
+    - `failed_picks` (abstract, a tuple of `PlanarPose`): the last 16 picks whose action did not
+      place an object, oldest first: the grasp was missed or lost, the object was pressed down, or
+      the action was stopped. A policy can use them to try another pick.
+    - `history` (abstract, a tuple of `Attempt`): the last 64 actions with a known outcome, oldest
+      first.
     - `peak_force` (3): the largest vertical and lateral contact force on the hand in the present or
-      last action, without the weight of the held object, in N, as means over 1/64 s; and the
-      `Mode` in which the larger of the two rose. See `ContactGuard`.
-    - `payload` (1): the vertical force of what the hand carries and lowers, as it was weighed, in
-      N; negative, or zero if nothing is known.
-    - `asks` (1): 1 if the next update, due at the context's time, evaluates `action`; else 0.
-    - `accepted_action` (abstract, `PickPlaceAction`): the last action begun, with the hand's actual
-      yaws and without heights; or the stop, with up to 24 objects and cavities of `left_over`.
+      last action, without the weight of the held object, in N, as means over 1/64 s; then the
+      `Mode` in which the larger of the two occurred. See `ContactGuard`.
+    - `payload` (1): the weight of the object that the hand carries or lowers, as a vertical force
+      in N. It is negative, or zero if the object has not been weighed.
+    - `asks` (1): 1 if the planner's next update, at the context's time, will evaluate `action`;
+      else 0.
+    - `accepted_action` (abstract, `PickPlaceAction`): the action that began last, with the hand's
+      actual yaws and without heights. After a stop it is the stopping action, with up to 24 objects
+      and 24 cavities in its `left_over`.
 
     Motions are smooth and as short as the limits on speed and acceleration allow (see
-    `systems.hand_motion`). In the plane they are straight lines; height and yaw have their own time
-    courses. When `CARRY` continues from an unfinished `LIFT`, only the velocity is continuous.
+    `systems.hand_motion`). In (x, y) they are straight lines; height and yaw move independently.
+    When `CARRY` continues from an unfinished `LIFT`, only the velocity is continuous.
 
     - `LIFT`, `RETREAT`: the hand rises above the highest surface of o_t before it travels.
     - `APPROACH`, `CARRY`: near its goal, the hand sinks to just above the surfaces there.
-    - `DESCEND`, `LOWER`: guarded motions. They stop dead when the vertical contact force exceeds
-      the payload's weight by `contact_threshold`. The heights of table, kit and cavity need not be
-      known, but where o_t shows a surface the hand slows down first, because the force of an impact
-      is proportional to the speed.
+    - `DESCEND`, `LOWER`: guarded motions, which stop at once when the vertical contact force
+      exceeds the payload's weight by `contact_threshold`. The heights of table, kit and cavity need
+      not be known exactly. Where o_t shows a surface, the hand slows down first, because the force
+      of an impact is proportional to the speed.
     - `CHECK`: a grasp is good if the pads are further apart than `minimum_width` and both feel at
-      least half of the grasp force. If it is not, or is lost later, the hand retreats and observes
-      again. The attempt counts as an action.
+      least half of the grasp force. If the grasp is not good, or is lost later, the hand retreats
+      and observes again. The attempt counts as an action.
     - `LIFT`, `CARRY`: the more the object weighs, the more firmly it is gripped (`grip_force`). A
       heavy object is lifted only once the grip is firm.
-    - `LIFT`: if the moment of the object's weight about the axis of the pads is more than they hold
-      (`turns_in_the_pads`), the object is set down again. The history then tells where its centre
-      of mass is, for a policy to grip it there.
-    - `SEARCH`: in tasks that insert, if the object stands on the rim around its place, the hand
-      searches for the cavity. It lowers again once the resistance ends.
-    - An action with `press` ends with `DESCEND`, with closed jaws, at `touch_speed`, until
-      `press_force` is reached.
-    - An action that the robot cannot reach ends before anything moves, as "unreachable".
+    - `LIFT`: if the moment of the object's weight about the axis of the pads is more than friction
+      holds (`turns_in_the_pads`), the object is set down again. The history then contains the
+      estimated centre of mass, so that a policy can grip the object there.
+    - `SEARCH`: in tasks that insert objects into cavities, if the object stands on the rim around
+      its place, the hand searches for the cavity. When the resistance ends, it lowers the object
+      further.
+    - An action with `press` consists of `APPROACH` and `DESCEND` with closed jaws. They touch the
+      object at `touch_speed` and press until `press_force` is reached.
+    - An action whose poses the robot cannot reach ends before anything moves, with the outcome
+      "unreachable".
     - In all modes, a contact force beyond `force_limit` ends the action (see `ContactGuard`): the
-      hand stops dead, lets go of what it holds, and retreats. It counts as a failed pick.
+      hand stops at once, lets go of the object, and retreats. The pick counts as failed.
 
-    State (discrete): one vector, the history, and what a stopping policy left over.
+    State (discrete): the `PlannerState`, the `AttemptHistory`, and the `LeftOver` of a policy that
+    stopped.
     """
 
     def __init__(
@@ -129,14 +138,15 @@ class PickPlacePlanner(LeafSystem):
     ) -> None:
         """
         Args:
-            parameters: heights, speeds, thresholds.
+            parameters: heights, speeds and thresholds.
             max_actions: stop after this many actions, unless `parameters.max_actions` overrides it.
-                Actions that set the object down again do not count.
-            motion: moves the hand; None: `HandMotion`.
+                Actions that set the object down again, because it would turn in the jaws, do not
+                count.
+            motion: computes the motions; None stands for `HandMotion`.
             insertion: whether to search for a cavity when a place is blocked.
             period: update period of the state machine, in s.
-            force_period: period of the force guard and of the guarded motions, in s: the plant's
-                step.
+            force_period: update period of the force guard and of the guarded motions, in s; use the
+                plant's time step.
         """
         super().__init__()
         self._parameters = parameters
@@ -150,7 +160,7 @@ class PickPlacePlanner(LeafSystem):
         search_steps = parameters.search.steps if insertion else 0
         self._steps = PickPlaceSteps(parameters, self._motion, self._guard, search_steps)
         self._period = period
-        # At times that they share, the first one declared comes first.
+        # When two events are due at the same time, Drake handles them in the order of declaration.
         self.DeclarePeriodicDiscreteUpdateEvent(force_period, 0.0, self._feel)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
@@ -284,7 +294,7 @@ class PickPlacePlanner(LeafSystem):
         return EventStatus.Succeeded()
 
     def _conclude(self, before: float, state: PlannerState, discrete_state: DiscreteValues) -> None:
-        """Writes an action into the history when the hand begins to retreat."""
+        """Writes the present action into the history when the hand begins to retreat."""
         if state.mode == Mode.RETREAT and before != Mode.RETREAT:
             history = AttemptHistory(discrete_state.get_mutable_value(self._history_index))
             outcome = _outcome(before, state)
@@ -321,7 +331,8 @@ class PickPlacePlanner(LeafSystem):
         self._motion.begin(state, Mode.APPROACH, time)
 
     def _has_spent(self, state: PlannerState) -> bool:
-        """Whether no action is left. One that sets the object down where it lay does not count."""
+        """Whether the limit of actions is reached. Actions that set the object down where it lay do
+        not count."""
         return bool(state.actions - state.free_actions >= self._max_actions)
 
     def _has_settled(self, state: PlannerState, time: float) -> bool:
@@ -356,7 +367,7 @@ def _action_of(state: PlannerState) -> PickPlaceAction:
 
 
 def _outcome(before: float, state: PlannerState) -> str:
-    """How an action has ended, by the mode before `RETREAT`."""
+    """The outcome of an action, a word of `OUTCOMES`, judged by the mode before `RETREAT`."""
     if state.refused:
         return "unreachable"
     if state.stops:
@@ -368,7 +379,8 @@ def _outcome(before: float, state: PlannerState) -> str:
 
 
 def _balance(state: PlannerState) -> tuple[float, float]:
-    """World (x, y) of the felt centre of mass, in m."""
+    """(x, y) of the object's centre of mass in the world, in m, as estimated from the wrist's
+    moment."""
     x, y, yaw = state.pick.tolist()
     return x + state.lever * math.cos(yaw), y + state.lever * math.sin(yaw)
 

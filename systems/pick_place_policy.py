@@ -30,7 +30,7 @@ class PolicyFunction(Protocol):
 
 
 class PolicyError(RuntimeError):
-    """A policy's function raised an exception, which is `__cause__`."""
+    """The policy function raised an exception, which is this error's `__cause__`."""
 
 
 class PickPlacePolicy(LeafSystem):
@@ -46,8 +46,8 @@ class PickPlacePolicy(LeafSystem):
         output_ports:
         - action
 
-    - `observation` (abstract, `Observation`): o_t. A policy that uses heights only has
-      `observation_heights` instead, whose colours may be missing.
+    - `observation` (abstract, `Observation`): o_t. If the policy uses only heights, the port is
+      called `observation_heights` instead, and the colours may be missing.
     - `failed_picks` (abstract, a tuple of `PlanarPose`): poses of failed grasps; empty if not
       connected.
     - `history` (abstract, a tuple of `Attempt`): the earlier actions, passed to the policy as
@@ -55,7 +55,7 @@ class PickPlacePolicy(LeafSystem):
     - `action` (abstract, `PickPlaceAction`): the policy's action.
 
     Evaluating the port calls the policy once for each new input. The policy must be stateless: the
-    Context does not hold it. Memory has to come in through a port.
+    Context does not hold its memory. Any memory must enter through an input port.
     """
 
     def __init__(self, *, policy: PolicyFunction, heights_only: bool = False) -> None:
@@ -64,7 +64,7 @@ class PickPlacePolicy(LeafSystem):
             policy: evaluating the port raises a `PolicyError` if the policy raises, a `TypeError`
                 if it does not return a `PickPlaceAction` of numbers, and a `ValueError` if its
                 poses are not finite.
-            heights_only: whether the policy uses heights only.
+            heights_only: whether the policy uses only the heights of o_t, not its colours.
         """
         super().__init__()
         self._policy = policy
@@ -100,8 +100,8 @@ class PickPlacePolicy(LeafSystem):
         """The action, with its poses converted to floats.
 
         Raises:
-            TypeError: a pose is not of numbers.
-            ValueError: a pose is not finite, or the reason is not a word of `STOP_REASONS`.
+            TypeError: a pose does not consist of numbers.
+            ValueError: a pose is not finite, or `reason` is not a key of `STOP_REASONS`.
         """
         if action.reason and action.reason not in STOP_REASONS:
             raise ValueError(

@@ -1,4 +1,4 @@
-"""The steps of the pick-and-place state machine once an action has begun."""
+"""The state machine of one pick and place, from the beginning of an action to its end."""
 
 from __future__ import annotations
 
@@ -23,28 +23,29 @@ from systems.robot_motion import RobotMotion
 _HOLDING = (Mode.LIFT, Mode.CARRY, Mode.LOWER, Mode.SEARCH, Mode.RELEASE)
 """The modes in which an object may be in the hand."""
 _STEADY = 0.6
-"""An object that hangs still keeps at least this share of its moment about the pads."""
+"""If an object's moment about the pads falls below this share of its earlier value, it has
+turned."""
 _RISEN = 0.0005
-"""The hand has begun to lift when it is this far above its grip, in m."""
+"""The hand counts as lifted when it is this far above its height at the grip, in m."""
 
 
 @dataclass(frozen=True)
 class Moment:
-    """The inputs of one step."""
+    """The inputs of one step of the state machine."""
 
     state: PlannerState
-    """The state, which the step modifies."""
+    """The planner's state, which the step modifies."""
     time: float
     hand: NDArray[np.float64]
-    """(12) the port `hand_state`."""
+    """(12) value of the planner's port `hand_state`."""
     contact: NDArray[np.float64]
-    """(6) the port `hand_contact_force`."""
+    """(6) value of the planner's port `hand_contact_force`."""
     wrist_moment: float = 0.0
-    """The port `wrist_moment`; zero if it is not connected."""
+    """Value of the planner's port `wrist_moment`, in N m; zero if it is not connected."""
 
 
 class PickPlaceSteps:
-    """The steps from `APPROACH` to `RETREAT`; see `PickPlacePlanner` for their law."""
+    """Executes the modes from `APPROACH` to `RETREAT`, as `PickPlacePlanner` documents them."""
 
     def __init__(
         self,
@@ -55,10 +56,10 @@ class PickPlaceSteps:
     ) -> None:
         """
         Args:
-            parameters: heights, speeds, thresholds.
+            parameters: heights, speeds and thresholds.
             motion: begins the motion of a mode.
-            guard: weighs the payload.
-            search_steps: how many offsets to try when a place is blocked.
+            guard: watches the contact force and weighs the payload.
+            search_steps: number of offsets to try when an insertion is blocked.
         """
         self._parameters, self._motion, self._guard = parameters, motion, guard
         self._search_steps = search_steps
@@ -74,17 +75,18 @@ class PickPlaceSteps:
         }
 
     def step(self, moment: Moment) -> None:
-        """Takes the step of the present mode."""
+        """Executes one step of the present mode."""
         self._steps.get(Mode(int(moment.state.mode)), self.follow)(moment)
 
     def feel(self, moment: Moment, acceleration: NDArray[np.float64]) -> None:
-        """Watches the contact force; to be called at every step of the plant.
+        """Watches the contact force. Call it at every step of the plant.
 
-        The guarded motions, `DESCEND` and `LOWER`, take their step here, so that they stop early.
+        The steps of `DESCEND` and `LOWER` are executed here as well, so that these motions stop
+        soon after a contact.
 
         Args:
             moment: the inputs.
-            acceleration: (3) commanded, in m/s^2.
+            acceleration: (3) commanded acceleration of the hand in the world, in m/s^2.
         """
         state, hand = moment.state, moment.hand
         must_stop = self._guard.feel(state, moment.contact, float(hand[2]), acceleration)
@@ -94,18 +96,18 @@ class PickPlaceSteps:
             self.step(moment)
 
     def stop(self, moment: Moment) -> None:
-        """Stops dead, lets go of what is in the hand, and retreats."""
+        """Stops the hand at once, lets go of the object in it, and retreats."""
         state = moment.state
         state.stopped, state.stops = state.stopped + 1, 1
         retreats, holds = state.mode == Mode.RETREAT, state.mode in _HOLDING
         following = Mode.RELEASE if holds else Mode.RETREAT
         self._motion.begin(state, following, moment.time, at=moment.hand[:4])
         if retreats:
-            # The jaws drag something along.
+            # The jaws drag something along, so open them fully.
             state.goal_opening = self._parameters.open_width
 
     def follow(self, moment: Moment) -> None:
-        """Goes on to the next mode when this one's motion has arrived."""
+        """Begins the next mode when the motion of the present one has arrived."""
         state, time = moment.state, moment.time
         if time >= self._motion.arrival(state):
             following = Mode.OBSERVE if state.mode == Mode.RETREAT else Mode(int(state.mode) + 1)
@@ -114,11 +116,12 @@ class PickPlaceSteps:
             self._motion.begin(state, following, time)
 
     def descend(self, moment: Moment) -> None:
-        """Stops at contact; to press, at the press force."""
+        """Moves down until contact, or in an action that presses, until the press force is
+        reached."""
         state, time, hand, contact = moment.state, moment.time, moment.hand, moment.contact
         if state.press:
             if contact[2] > self._parameters.press_force:
-                # Stop dead: braking would press harder.
+                # Stop at once: during braking the hand would press harder.
                 self._motion.begin(state, Mode.RETREAT, time, z=hand[2])
             elif time >= self._motion.arrival(state):
                 self._motion.begin(state, Mode.RETREAT, time)
@@ -130,24 +133,25 @@ class PickPlaceSteps:
             self._motion.begin(state, Mode.CLOSE, time)
 
     def close(self, moment: Moment) -> None:
-        """Stops the jaws when they stall."""
+        """Closes the jaws until they stall, then squeezes."""
         state, time, hand = moment.state, moment.time, moment.hand
         opening, rate = hand[4] + hand[5], hand[10] + hand[11]
         moving_for = time - state.start_time
-        # Stalled jaws lag behind the command by the deflection of the fingers' spring.
+        # Stalled jaws lag behind their command by the force divided by the stiffness of the
+        # fingers' control.
         commanded, _ = self._motion.opening_at(state, time)
         stalled = moving_for > 0.1 and abs(rate) < 2e-3 and commanded < opening - 1e-3
         if stalled or commanded <= 0.0:
             self._motion.begin(state, Mode.CHECK, time, opening=opening)
 
     def check(self, moment: Moment) -> None:
-        """Lifts what is between the pads, or retreats."""
+        """Begins the lift if an object is between the pads, else retreats."""
         state, time, hand, contact = moment.state, moment.time, moment.hand, moment.contact
         if time < self._motion.arrival(state) + self._settle:
             return
         if self._is_held(hand, contact):
             state.hold_z = hand[2]
-            # Gripped higher than planned, the object hangs lower.
+            # If the object is gripped higher than planned, it hangs lower below the fingertips.
             higher = max(hand[2] - state.grasp_z, 0.0)
             state.travel_z += higher
             state.place_hover_z += higher
@@ -157,7 +161,7 @@ class PickPlaceSteps:
             self._motion.begin(state, Mode.RETREAT, time)
 
     def lift(self, moment: Moment) -> None:
-        """Lifts the object, or sets it down again if it would turn between the pads."""
+        """Lifts the object. Sets it down again if it would turn between the pads."""
         state, time = moment.state, moment.time
         desired = self._motion.motion_at(state, time)
         acceleration = float(self._motion.hand_acceleration(state, time, desired)[Z])
@@ -180,18 +184,19 @@ class PickPlaceSteps:
             self.hold(moment)
 
     def _end_trial(self, moment: Moment, lever: float, weight: float) -> None:
-        """Goes on with the lift if the object hangs still, else sets it down.
+        """Ends a trial lift: continues to lift if the object has not turned, else sets it down.
 
         Args:
             moment: the inputs, after the hand has rested.
-            lever: of `felt_lever` now, in m.
-            weight: in N.
+            lever: present result of `felt_lever`, in m.
+            weight: the object's weight, in N.
         """
         state = moment.state
-        # An object that turns until it leans on the table takes the moment off the pads.
+        # An object that has turned until it leans on the table exerts less moment on the pads.
         has_turned = abs(lever) < _STEADY * abs(state.lever)
         lever = float(state.lever) if has_turned else lever
-        # There is no indulgence for one that does turn.
+        # The allowed moment grows with the number of earlier attempts, but not for an object that
+        # has turned.
         times = 0.0 if has_turned else float(state.set_downs)
         if turns_in_the_pads(lever * weight, times):
             state.lever = lever
@@ -204,12 +209,13 @@ class PickPlaceSteps:
         """Lowers the object where it was picked."""
         state = moment.state
         self._guard.tare(state, moment.contact, self._parameters.contact_threshold)
-        # It may touch at any height: go slowly, and let go at the first touch.
+        # The object may touch the table at any height, so move slowly and let go at the first
+        # contact.
         state.floor_z, state.rim_z = state.travel_z, state.table_z
         self._motion.begin(state, Mode.LOWER, moment.time)
 
     def hold(self, moment: Moment) -> None:
-        """Lifts and carries while an object is held."""
+        """Lifts and carries the object while it is held, and adapts the grip force."""
         state, time, hand, contact = moment.state, moment.time, moment.hand, moment.contact
         desired = self._motion.motion_at(state, time)
         acceleration = self._motion.hand_acceleration(state, time, desired)
@@ -217,7 +223,7 @@ class PickPlaceSteps:
         force = grip_force(weight, float(state.goal_force), self._parameters)
         self._motion.set_force(state, time, force)
         if state.mode == Mode.LIFT and lifts_too_early(force, self._motion.force_at(state, time)):
-            # Brake, and go on when the grip is firm.
+            # Brake, and continue when the grip is firm.
             self._motion.begin(state, Mode.LIFT, time)
         if not self._is_held(hand, contact):
             state.dropped += 1
@@ -230,7 +236,7 @@ class PickPlaceSteps:
             self._motion.begin(state, Mode.LOWER, time)
 
     def lower(self, moment: Moment) -> None:
-        """Stops at contact, and searches if the object stands on a rim."""
+        """Lowers the object until contact. Begins the search if it then stands on a rim."""
         state, time, hand, contact = moment.state, moment.time, moment.hand, moment.contact
         if not self._is_held(hand, contact):
             state.dropped += 1

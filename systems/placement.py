@@ -1,5 +1,5 @@
-"""Goals, the errors of placements, and success predicates, for `PlacementMonitor` and
-`OraclePolicy`."""
+"""Defines goals, measures the errors of placements, and decides about success, for
+`PlacementMonitor` and `OraclePolicy`."""
 
 from __future__ import annotations
 
@@ -28,10 +28,12 @@ ALL = 1 - 1e-9
 """A share or a reward above this counts as 1."""
 
 GONE = 10.0
-"""An object this far from the world's origin, in metres, has left the cell or not yet appeared."""
+"""An object at least this far from the world's origin, in metres, has left the cell or has not
+appeared yet."""
 
 _FAR = 0.5
-"""Displacements are capped at this when objects are assigned to goals, in metres."""
+"""Upper limit of the displacements that are compared when objects are assigned to goals, in
+metres."""
 _NEAR = 0.05
 """Only an object within this distance of a goal is tested for filling it, in metres."""
 _FREE_ANGLES = 24
@@ -48,23 +50,23 @@ class PlacedObject:
     p_BPoints: NDArray[np.float64]
     """(m, 3) points sampled uniformly by area from the object's surface, in metres."""
     symmetry: int = 1
-    """Order of the rotational symmetry about body z; 1 for none. Declared with the object."""
+    """Order of the object's rotational symmetry about body z; 1 for none."""
     axis: tuple[float, float] | None = None
-    """(x, y) of the axis of symmetry in B, in metres; None: the middle of the points' bounding
-    box. The two differ if the order is odd, as of a triangle."""
+    """(x, y) of the axis of symmetry in B, in metres; None stands for the middle of the points'
+    bounding box. The two differ if the order of the symmetry is odd, as for a triangle."""
     p_BCom: NDArray[np.float64] | None = None
-    """(3,) the centre of mass, in metres; None: unknown."""
+    """(3,) the centre of mass in B, in metres; None if it is unknown."""
 
     @property
     def p_BCenter(self) -> NDArray[np.float64]:
-        """(3,) the centre of mass or, if it is unknown, the middle of the surface."""
+        """(3,) the centre of mass in B or, if it is unknown, `p_BMiddle`."""
         return self.p_BPoints.mean(axis=0) if self.p_BCom is None else self.p_BCom
 
     @cached_property
     def p_BMiddle(self) -> NDArray[np.float64]:
-        """(3,) the point where positions are compared: the middle of the points' bounding box, or
-        the same height on the `axis`. Unlike the origin of B, it lies on the axis of a round object
-        and stays there as the object rolls."""
+        """(3,) the point in B that is used to compare positions: the middle of the points' bounding
+        box, or the point of the same height on the `axis`. Unlike the origin of B, it lies on the
+        axis of a round object and does not move as the object rolls in place."""
         middle = (self.p_BPoints.min(axis=0) + self.p_BPoints.max(axis=0)) / 2
         return middle if self.axis is None else np.array([*self.axis, middle[2]])
 
@@ -86,26 +88,27 @@ class PlacedObject:
 
 @dataclass(frozen=True)
 class Goal:
-    """A goal: place any of some objects in any of some poses."""
+    """A goal that one of several objects can fill, in one of several poses."""
 
     name: str
     objects: tuple[int, ...]
-    """Objects that may fill the goal, as indices into the scene's."""
+    """Indices, in the scene's list, of the objects that may fill the goal."""
     poses: tuple[RigidTransform, ...]
     """X_WGoal: poses of the object's frame, any of which fills the goal."""
     reward: float
     """Share of the episode's score; the goals' shares add up to 1."""
     after: tuple[int, ...] = ()
-    """Goals that must be filled before this one counts, as indices into the scene's."""
+    """Indices, in the scene's list, of the goals that must be filled before this one counts."""
     any_heading: bool = False
     """Whether the object's rotation about world z is ignored."""
     rim_height: float | None = None
-    """World z of the rim of the cavity that the object goes into, in metres; None: no cavity. Of a
-    tilted cavity: at its middle."""
+    """World z of the rim of the cavity that the object goes into, in metres; None if there is no
+    cavity. For a tilted cavity it is the height at the middle."""
     highest: float | None = None
-    """World z of the highest point of a tilted cavity's fixture, in metres; None: not tilted."""
+    """World z of the highest point of the fixture with a tilted cavity, in metres; None if the
+    cavity is level."""
     fixture: int = 0
-    """The fixture with the cavity, as index into the scene's."""
+    """Index, in the scene's list, of the fixture with the cavity."""
 
 
 @dataclass(frozen=True)
@@ -117,15 +120,16 @@ class Placement:
     pose: int = 0
     """Index of the nearest of the goal's poses."""
     add_s: float = math.inf
-    """Equation 9 of the paper, in metres."""
+    """ADD-S, equation 9 of the paper, in metres."""
     position_error: float = math.inf
-    """Horizontal distance between the middles (`PlacedObject.p_BMiddle`), in metres. This and the
-    errors below are measured in the frame of the goal: of a tilted cavity, along its floor."""
+    """Distance between the object's middle (`PlacedObject.p_BMiddle`) and its goal, parallel to the
+    goal's (x, y) plane, in metres. All errors are measured in the goal's frame, which is tilted
+    with a tilted cavity."""
     angle_error: float = math.inf
     """Heading error about world z, modulo the object's symmetry, in radians; zero if the goal
     accepts any heading."""
     height_error: float = math.inf
-    """Height of the middle above the goal's, in metres."""
+    """Height of the object's middle above its goal, in metres."""
     share: float = 0.0
     """Earned share of the goal's reward, 0 to 1; 0 until the goal's prerequisites are filled."""
 
@@ -136,7 +140,7 @@ class Placement:
 
     @property
     def strict_success(self) -> bool:
-        """Success with the right height and heading, too."""
+        """Whether the object fills its goal and also has the right height and heading."""
         return (
             self.success
             and abs(self.height_error) <= STRICT_HEIGHT
@@ -156,7 +160,7 @@ class SuccessPredicate(Protocol):
         """The share of the goal's reward, 0 to 1, that a pose earns.
 
         Args:
-            placement: the errors; its own `share` is not set yet.
+            placement: the errors; its `share` is not set yet.
             X_WB: the object's pose.
         """
         ...
@@ -167,7 +171,7 @@ class AddS:
     """Success by the paper's measure (section IV-C): ADD-S below a threshold."""
 
     threshold: float = 0.0035
-    """In metres."""
+    """Largest ADD-S of a success, in metres."""
 
     @property
     def description(self) -> str:
@@ -182,11 +186,11 @@ class PoseWithin:
     """Success as in Ravens: pose errors below thresholds."""
 
     position: float = 0.01
-    """Horizontal, in metres."""
+    """Largest horizontal distance from the goal, in metres."""
     angle: float = math.radians(15.0)
-    """Modulo the object's symmetry, in radians."""
+    """Largest heading error, modulo the object's symmetry, in radians."""
     height: float | None = None
-    """In metres; None: heights are not compared."""
+    """Largest height error, in metres; None if heights are not compared."""
 
     @property
     def description(self) -> str:
@@ -203,7 +207,7 @@ class PoseWithin:
 
 @dataclass(frozen=True)
 class InZone:
-    """Success as in Ravens' zones: the share of an object's volume inside a box."""
+    """Success as in the Ravens tasks with zones: the share of an object's volume inside a box."""
 
     X_WZone: RigidTransform
     """The zone's frame, with its origin at the middle of the zone's bottom."""
@@ -232,15 +236,15 @@ def heading(X_WB: RigidTransform) -> float:
 
 
 def is_tilted(X_WB: RigidTransform) -> bool:
-    """Whether body z is not upright, by more than rounding."""
+    """Whether body z deviates from the vertical by more than rounding errors."""
     return bool(X_WB.rotation().matrix()[2, 2] < 1 - 1e-9)
 
 
 def add_s(points: NDArray[np.float64], X_WGoal: RigidTransform, X_WActual: RigidTransform) -> float:
     """The average distance for symmetric objects, equation 9 of the paper, in metres.
 
-    The mean, over the model's points at the goal pose, of the distance to the *nearest* model point
-    at the actual pose. A rotation that maps the points onto themselves costs nothing.
+    It is the mean, over the model's points at the goal pose, of the distance to the *nearest* model
+    point at the actual pose. A rotation that maps the points onto themselves adds no error.
 
     The measure is lenient: a flat object that protrudes by h scores about h / 2, and a reversed one
     may pass the paper's threshold. See `Placement.strict_success`.
@@ -282,15 +286,16 @@ def evaluate_placements(
     object lies at the end of a correct row, every object could get its neighbour's goal.
 
     Args:
-        objects: n of them.
+        objects: the n objects.
         goals: the goals of the task.
         success: decides when a goal is filled.
-        poses: n, X_WB of each object.
-        kept: goals that count as filled in the prerequisites of others (`complete_stages`).
+        poses: X_WB of each of the n objects.
+        kept: indices of goals that count as filled when they are prerequisites of others (see
+            `complete_stages`).
 
     Returns:
-        One for each object, in order. The errors are infinite for an object without a goal, or
-        whose pose is not finite because the simulation diverged.
+        One placement for each object, in order. The errors are infinite for an object without a
+        goal, and for an object whose pose is not finite because the simulation diverged.
     """
     placements = [Placement() for _ in objects]
     for index, goal_index, pose_index in _assign(objects, goals, success, poses):
@@ -317,7 +322,7 @@ def _assign(
     success: SuccessPredicate,
     poses: Sequence[RigidTransform],
 ) -> list[tuple[int, int, int]]:
-    """(object, goal, pose) of each pair."""
+    """Indices (object, goal, pose of the goal) of each assigned pair."""
     # A forbidden pair costs more than any assignment of allowed pairs.
     cost = np.full((len(objects), len(goals)), 10.0 * _FAR * max(len(objects), 1))
     nearest = np.zeros(cost.shape, int)
@@ -350,14 +355,15 @@ def _assign(
 def displacement(
     item: PlacedObject, X_WGoal: RigidTransform, X_WB: RigidTransform, *, any_heading: bool = False
 ) -> float:
-    """The mean distance of the corners of an object's bounding box from their goal, in metres.
+    """The mean distance of the corners of an object's bounding box from where they are at the goal
+    pose, in metres.
 
-    It is the smallest over the rotations of the object's symmetry.
+    Of all rotations by the object's symmetry, the one with the smallest distance counts.
 
     Args:
         item: the object.
-        X_WGoal: its goal pose.
-        X_WB: its actual pose.
+        X_WGoal: the object's goal pose.
+        X_WB: the object's actual pose.
         any_heading: whether the goal accepts any heading.
     """
     here = X_WB.multiply(item.p_BCorners.T)
@@ -369,7 +375,8 @@ def displacement(
 
 
 def _turn(item: PlacedObject, step: int, order: int) -> NDArray[np.float64]:
-    """(8, 3) the corners, rotated about the body's z axis through its middle."""
+    """(8, 3) the corners of the object's bounding box in B, rotated by `step` / `order` of a turn
+    about the axis through its middle."""
     if step == 0:
         return item.p_BCorners
     R = RollPitchYaw(0, 0, step * math.tau / order).ToRotationMatrix().matrix()
@@ -412,14 +419,15 @@ def _measure(
 def complete_stages(
     goals: Sequence[Goal], placements: Sequence[Placement], kept: Set[int] = frozenset()
 ) -> frozenset[int]:
-    """The goals that are prerequisites of others and were once all filled at the same time.
+    """Indices of the goals that are prerequisites of the same goal and have been filled at the same
+    time.
 
-    As in the Ravens benchmark, their reward is kept even if the objects move later.
+    As in the Ravens benchmark, the reward of such a stage is kept even if its objects move later.
 
     Args:
         goals: the goals of the task.
-        placements: the present ones, evaluated with `kept`.
-        kept: goals that were complete before.
+        placements: the present placements, evaluated with `kept`.
+        kept: indices of the goals of stages that were complete before.
     """
     filled = kept | {item.goal for item in placements if item.success}
     return frozenset(kept).union(*(goal.after for goal in goals if filled >= {*goal.after}))
@@ -432,8 +440,8 @@ def total_reward(
 
     Args:
         goals: the goals of the task.
-        placements: the present ones, evaluated with `kept`.
-        kept: goals that always count as filled (`complete_stages`).
+        placements: the present placements, evaluated with `kept`.
+        kept: indices of goals that always count as filled (see `complete_stages`).
     """
     shares = {item.goal: item.share for item in placements if item.goal is not None}
     shares |= dict.fromkeys(kept, 1.0)

@@ -29,7 +29,7 @@ from systems.weak_calc import weak_calc
 
 
 class PlacementMonitor(LeafSystem):
-    """Compares the objects' poses with their goals.
+    """Compares the objects' poses with their goals, and computes errors and the reward.
 
     .. pydrake_system::
 
@@ -52,13 +52,13 @@ class PlacementMonitor(LeafSystem):
     - `placements` (abstract, list of n `Placement`): one for each object, by the law of
       `evaluate_placements`.
     - `reward` (1): the sum of the goals' rewards, each multiplied by its earned share.
-    - `success` (n): 1 for an object that fills a goal.
+    - `success` (n): 1 for an object that fills its goal, else 0.
     - `add_s` (n): equation 9, metres; infinite for an object without a goal.
     - `position_error`, `angle_error`, `height_error` (n): see `Placement`; metres, radians.
-    - `kept_goals` (one for each goal): 1 for goals of a stage that was complete when an action
-      began. They count as filled from then on (`complete_stages`).
+    - `kept_goals` (one element for each goal): 1 for goals of a stage that was complete when an
+      action began, else 0. They count as filled from then on (see `complete_stages`).
 
-    State (discrete): the kept goals, and the last mode. Ports compute only on demand.
+    State (discrete): the kept goals, and the planner's last mode. Ports compute only on demand.
     """
 
     def __init__(
@@ -71,13 +71,14 @@ class PlacementMonitor(LeafSystem):
     ) -> None:
         """
         Args:
-            objects: n of them.
-            goals: at least one.
+            objects: the n objects.
+            goals: at least one goal.
             success: decides when a goal is filled.
-            period: period of reading the mode, in s; use the planner's.
+            period: period with which the mode is read, in s; use the planner's.
 
         Raises:
-            ValueError: no goals, a goal without object or pose, or an object without points.
+            ValueError: there are no goals, a goal has no object or no pose, or an object has no
+                points.
         """
         super().__init__()
         if not goals:

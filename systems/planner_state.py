@@ -9,7 +9,7 @@ X, Y, Z, YAW = range(4)
 
 
 RECENT = 16
-"""How many contact forces the state keeps."""
+"""Number of the latest contact forces that the state keeps."""
 
 
 class PlannerState(VectorView):
@@ -19,15 +19,15 @@ class PlannerState(VectorView):
     start_time = Number()
     duration = Number()
     start = Array(4)
-    """x, y, z and yaw at the start of the present motion."""
+    """x, y, z and yaw of the hand at the start of the present motion."""
     goal = Array(4)
-    """x, y, z and yaw at its end."""
+    """x, y, z and yaw of the hand at the end of the present motion."""
     start_rate = Array(4)
-    """The velocities at its start."""
+    """Velocities of x, y, z and yaw at the start of the present motion."""
     delays = Array(3)
-    """When each of the motion's `PARTS` begins, after `start_time`."""
+    """Times, after `start_time`, at which (x, y), z and yaw begin to travel."""
     leg_ways = Array(3)
-    """The ways of a guarded motion along z, in order; zero if there is none."""
+    """Displacements along z of the legs of a guarded motion, in order; zero for unused legs."""
     leg_delays = Array(3)
     start_opening = Number()
     goal_opening = Number()
@@ -35,7 +35,7 @@ class PlannerState(VectorView):
     goal_force = Number()
     force_start_time = Number()
     pick = Array(3)
-    """x, y and yaw of the hand at the pick. Likewise `place`."""
+    """x, y and yaw of the hand at the pick; `place` holds those at the place."""
     place = Array(3)
     grasp_z = Number()
     travel_z = Number()
@@ -48,27 +48,29 @@ class PlannerState(VectorView):
     rim_z = Number()
     floor_z = Number()
     doubt = Number()
-    """The uncertainty of these heights."""
+    """The uncertainty of the surface heights."""
     width = Number()
     """The width of the object at the pick; infinite if unknown."""
     hold_z = Number()
-    """Height of the hand when it gripped; `touch_z`: when the object touched a cavity's rim."""
+    """Height of the fingertips when the jaws had gripped the object. `touch_z` is the height at
+    which the object touched a cavity's rim."""
     touch_z = Number()
     search_step = Number()
     payload = Number()
-    """The vertical force of the payload, in N."""
+    """The vertical force of the payload on the hand, in N; negative or zero."""
     weighings = Number()
-    """How many samples the payload is the mean of."""
+    """Number of samples in the mean that gives `payload`."""
     beyond = Number()
-    """For how long the contact force has been beyond the limit, in s."""
+    """Time for which the contact force has exceeded the limit without interruption, in s."""
     recent = Array(3 * RECENT)
-    """x, y and z of the last contact forces, latest first, without weight and inertia of the held
-    object, in N."""
+    """x, y and z of the latest contact forces, latest first, without the weight and inertia of the
+    held object, in N."""
     peak_vertical = Number()
-    """The largest contact forces of the action, in N."""
+    """The largest vertical contact force of the action, in N. `peak_lateral` is the largest lateral
+    one."""
     peak_lateral = Number()
     peak_mode = Number()
-    """The mode in which the larger one rose."""
+    """The mode in which the larger of the two peak forces occurred."""
     actions = Number()
     missed = Number()
     dropped = Number()
@@ -76,28 +78,29 @@ class PlannerState(VectorView):
     stops = Number()
     """1 if the force guard has ended the action, else 0."""
     refused = Number()
-    """1 if the action cannot be reached, else 0."""
+    """1 if the robot cannot reach the action's poses, else 0."""
     press = Number()
     """1 if the action presses, else 0."""
     aside = Number()
     """1 if the action lays the object aside, else 0."""
     lever = Number()
-    """How far the centre of mass of an object that is set down lies from the pads' middle along
-    them, in m."""
+    """Position of the object's centre of mass relative to the pads' middle, along the pads, in m,
+    if the object is set down again."""
     doubts_grip = Number()
-    """1 if the object seems to turn between the pads, and is set down again if it does, else 0."""
+    """1 during a trial lift of an object that may turn between the pads, else 0."""
     set_downs = Number()
-    """How many earlier actions have set this object down."""
+    """Number of earlier actions that set this object down again."""
     free_actions = Number()
-    """How many actions do not count against the limit, because they set the object down."""
+    """Number of actions that do not count against the limit, because they set the object down
+    again."""
     stop = Number()
-    """0 while there are actions; then 1 plus the index of the reason in `STOP_REASONS`."""
+    """0 until the planner stops; then 1 plus the index of the reason in `STOP_REASONS`."""
 
     def set_heights(self, motion: MotionHeights, surfaces: SurfaceHeights) -> None:
-        """Writes the heights of an action."""
+        """Stores the heights of an action in the state."""
         self.grasp_z, self.pick_top_z = motion.grasp, surfaces.pick_top
         self.table_z, self.support_z = surfaces.table, surfaces.support
-        # An object slightly below an uncertain rim may stand on it.
+        # Lower an uncertain rim: an object that seems slightly below the rim may stand on it.
         self.rim_z = surfaces.place_rim - surfaces.doubt
         self.floor_z, self.doubt = surfaces.place_floor, surfaces.doubt
         self.width = surfaces.width

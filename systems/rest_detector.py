@@ -1,4 +1,4 @@
-"""Detects objects that rest out of reach of everything that moves, so that they can sleep."""
+"""Detects objects at rest with nothing moving near them, so that they can be frozen."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ class BoundedBody:
 
 
 class _Boxes:
-    """k boxes, as arrays."""
+    """The half sizes and poses of k boxes, as arrays."""
 
     def __init__(self, boxes: Sequence[Box]) -> None:
         self.poses = np.array([box.X_BBox.GetAsMatrix34() for box in boxes])
@@ -41,14 +41,14 @@ class _Boxes:
         """Rotations (k, 3, 3), centres (k, 3) and half sizes (k, 3) of the posed boxes.
 
         Args:
-            X: pose of the frame, (3, 4), or of each box's own, (k, 3, 4).
+            X: pose of the boxes' common frame, (3, 4), or of each box's own frame, (k, 3, 4).
         """
         rotations = X[..., :3] @ self.poses[:, :, :3]
         centres = np.einsum("...ij,...j->...i", X[..., :3], self.poses[:, :, 3]) + X[..., 3]
         return rotations, centres, self.halves
 
     def enclosing(self) -> Box:
-        """The box around all boxes, aligned with the frame."""
+        """The box around all boxes, aligned with their common frame."""
         reach = np.einsum("kij,kj->ki", np.abs(self.poses[:, :, :3]), self.halves)
         lower = (self.poses[:, :, 3] - reach).min(axis=0)
         upper = (self.poses[:, :, 3] + reach).max(axis=0)
@@ -58,9 +58,9 @@ class _Boxes:
 def _gaps(
     first: Sequence[NDArray[np.float64]], second: Sequence[NDArray[np.float64]]
 ) -> NDArray[np.float64]:
-    """(a, b) lower bounds of the distances between a boxes and b others, in metres.
+    """(m, n) lower bounds of the distances between m boxes and n other boxes, in metres.
 
-    The bound is the widest gap along the six face normals of a pair.
+    The bound is the widest gap along the six face normals of the two boxes.
     """
     (R_i, centres_i, halves_i), (R_j, centres_j, halves_j) = first, second
     apart = centres_i[:, None] - centres_j[None]
@@ -91,12 +91,12 @@ class RestDetector(LeafSystem):
     - For `time_to_sleep` it has stayed within both tolerances of one pose. Displacements are
       compared, not velocities, because an object may tremble in place if the time step is too long
       for its stiffness.
-    - No mover, and no object that is awake, is within `wake_distance` of it. Distances are those
-      of the oriented boxes around the collision geometry, which are lower bounds.
+    - No mover, and no object that is not at rest, is within `wake_distance` of it. The distances
+      are those of the oriented boxes around the collision geometry, which are lower bounds.
 
-    It wakes when something comes within `wake_distance`. An object that has left the cell (it is
-    `GONE` or farther from the world's origin) rests at once, because a body that spins forever
-    would overflow its quaternion.
+    It wakes when a mover, or an object that is not at rest, comes within `wake_distance`. An object
+    that has left the cell (its distance from the world's origin is `GONE` or more) is at rest at
+    once, because a body that spins forever would overflow its quaternion.
 
     State (discrete): for each object the pose that it stays near, the time that it has stayed
     there (s), and whether it rests.
@@ -118,10 +118,11 @@ class RestDetector(LeafSystem):
             objects: n bodies that may come to rest.
             movers: bodies that never rest: the links of the hand.
             position_tolerance: the position tolerance of the body's origin, in m.
-            angle_tolerance: in rad.
-            time_to_sleep: in s.
-            wake_distance: in m. A body that moves farther than this within one period may hit a
-                sleeping object, which stays fixed until the next update.
+            angle_tolerance: the tolerance of the body's orientation, in rad.
+            time_to_sleep: how long an object must stay in place, in s.
+            wake_distance: distance at which something wakes an object, in m. A body that moves
+                farther than this within one period may hit an object at rest, which stays fixed
+                until the next update.
             period: the period of the updates, in s.
         """
         super().__init__()
@@ -131,7 +132,8 @@ class RestDetector(LeafSystem):
         self._pieces = [_Boxes(item.boxes) for item in bodies]
         self._wholes = _Boxes([pieces.enclosing() for pieces in self._pieces])
         self._position_tolerance = position_tolerance
-        # R(a) differs from the identity by 2 sqrt(2) sin(a / 2) in Frobenius norm.
+        # A rotation by the angle a differs from the identity by 2 sqrt(2) sin(a / 2) in the
+        # Frobenius norm.
         self._rotation_tolerance = 2 * np.sqrt(2) * np.sin(angle_tolerance / 2)
         self._time_to_sleep = time_to_sleep
         self._wake_distance = wake_distance
@@ -145,7 +147,7 @@ class RestDetector(LeafSystem):
         self.DeclareStateOutputPort("at_rest", self._at_rest)
 
     def at_rest(self, context: Context) -> NDArray[np.bool_]:
-        """(n,) which objects are at rest, in this system's context."""
+        """(n,) whether each object is at rest, in this system's context."""
         return context.get_discrete_state(self._at_rest).value() > 0.5
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
@@ -163,17 +165,17 @@ class RestDetector(LeafSystem):
         still_for[:] = np.where(stayed, still_for + self._period, 0.0)
         resting = stayed & (still_for >= self._time_to_sleep - self._period / 2)
         self._wake(X, resting)
-        # Also true for NaN.
+        # This form is also true for NaN.
         resting |= ~(np.square(X[:n, :, 3]).sum(axis=1) < GONE**2)
         discrete_state.get_mutable_value(self._at_rest)[:] = resting
         return EventStatus.Succeeded()
 
     def _wake(self, X: NDArray[np.float64], resting: NDArray[np.bool_]) -> None:
-        """Clears `resting` of objects that have something awake near them.
+        """Sets `resting` to false for objects near a body that is not at rest.
 
         Args:
             X: (bodies, 3, 4) X_WB of each body.
-            resting: (n,) modified.
+            resting: (n,) whether each object rests; modified.
         """
         if not resting.any():
             return

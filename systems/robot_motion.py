@@ -12,30 +12,34 @@ from systems.planner_state import PlannerState
 
 
 class RobotMotion(Protocol):
-    """The motions of all modes, as functions of the planner's state; keeps no memory.
+    """Computes the motions of all modes as functions of the planner's state. It keeps no state of
+    its own.
 
-    Implementations: `HandMotion`, `ArmMotion`. The planner speaks of modes, heights and hand poses
-    only. Times are in s, lengths in m.
+    `HandMotion` and `ArmMotion` implement it. The planner deals only with modes, heights and hand
+    poses. Times are in s, lengths in m.
     """
 
     size: int
-    """Number of elements of the desired motion."""
+    """Number of elements of the vector `motion_at`."""
     settles: float
-    """After this time at rest the hand is still; infinite if the parameters say how long."""
+    """Time after the end of a motion until the hand no longer vibrates; infinite if a parameter of
+    the planner sets this time."""
 
     def initial_state(self) -> NDArray[np.float64]:
         """A state in which the hand waits at home with open jaws."""
 
     def view(self, vector: NDArray[np.float64]) -> PlannerState:
-        """The fields of a state vector."""
+        """Names the fields of a state vector, without a copy."""
 
     def prepare(self, state: PlannerState) -> bool:
         """Chooses how to execute an action before it begins.
 
-        Pick, place and heights are in the state; their yaws may be exchanged for equivalent ones.
+        Pick, place and heights are in the state. This function may replace the yaws of pick and
+        place by equivalent ones.
 
         Returns:
-            Whether the robot can reach everything. If not, it must not move in `APPROACH`.
+            Whether the robot can reach pick and place. If it cannot, it must not move in
+            `APPROACH`.
         """
 
     def begin(
@@ -53,33 +57,36 @@ class RobotMotion(Protocol):
             state: the planner's state; modified.
             mode: the mode to begin.
             time: the present time.
-            z: stop the fingertips at this height.
-            opening: stop the jaws at this opening.
-            at: (4) stop the hand at this x, y, z and yaw.
+            z: if given, the fingertips stop at this height.
+            opening: if given, the jaws stop at this opening.
+            at: if given, (4) x, y, z and yaw at which the hand stops.
         """
 
     def back_off(self, state: PlannerState, distance: float) -> None:
         """Raises the goal of the present mode, a straight line of the hand, by a distance."""
 
     def motion_at(self, state: PlannerState, time: float) -> NDArray[np.float64]:
-        """(size) q_d, v_d, a_d of the robot's joints."""
+        """(size) desired positions, velocities and accelerations of the robot's joints at a
+        time."""
 
     def hand_acceleration(
         self, state: PlannerState, time: float, desired: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """(3) of the motion `desired`, which is that of `motion_at`, in m/s^2."""
+        """(3) acceleration of the fingertips in the world, in m/s^2. `desired` is the result of
+        `motion_at` at this time."""
 
     def arrival(self, state: PlannerState) -> float:
-        """When motion, jaws and force of the present mode have all arrived."""
+        """The time at which motion, jaws and closing force of the present mode have all reached
+        their goals."""
 
     def brakes_above(self, state: PlannerState, time: float, height: float) -> bool:
         """Whether the hand, in `LIFT`, stays above a height if `CARRY` begins now."""
 
     def set_force(self, state: PlannerState, time: float, force: float) -> None:
-        """Ramps the closing force from its present value to another, in N."""
+        """Ramps the closing force from its present value to `force`, in N."""
 
     def opening_at(self, state: PlannerState, time: float) -> tuple[float, float]:
-        """The opening between the pads, and its rate."""
+        """The opening between the pads at a time, and its rate."""
 
     def force_at(self, state: PlannerState, time: float) -> float:
-        """The closing force, in N."""
+        """The closing force at a time, in N."""

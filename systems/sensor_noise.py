@@ -1,4 +1,4 @@
-"""The errors of a real RGB-D camera: noise, holes and calibration errors."""
+"""Simulates the errors of a real RGB-D camera: noise, holes and calibration errors."""
 
 import dataclasses as dc
 import math
@@ -17,31 +17,33 @@ from systems.bounds import bounded
 from systems.weak_calc import weak_calc
 
 SHEEN_LABELS = 20000
-"""Render label SHEEN_LABELS + p marks a surface whose sheen turns p percent of it into holes."""
+"""The render label SHEEN_LABELS + p marks a shiny surface, p percent of which become holes."""
 
 _RIG_STREAM, _CAMERA_STREAM, _DEPTH_STREAM = 14, 15, 16
-"""Random streams of a seed; smaller numbers belong to scenes and other draws. Avoid zero: NumPy
-treats [seed, 2, 0] like [seed, 2]."""
+"""Numbers of this module's random streams, which NumPy gets together with the seed. Other modules
+use smaller numbers. Zero is avoided, because NumPy treats [seed, 2, 0] like [seed, 2]."""
 _TIME_RESOLUTION = 1e-6
 """Images farther apart in time than this, in seconds, have independent noise."""
 _HOLE_RADIUS = 3.0
-"""Smoothing radius of the field whose highest parts become holes, in pixels."""
+"""Smoothing radius, in pixels, of the random field whose highest parts become holes."""
 _EDGE = 0.015
-"""A difference between neighbouring depths above this is an edge, in metres."""
+"""Neighbouring depths that differ by more than this, in metres, belong to different sides of an
+edge."""
 
 
 @dc.dataclass
 class SensorNoiseParameters:
-    """Imperfections of the RGB-D cameras and their calibration. All zero: perfect."""
+    """Imperfections of the RGB-D cameras and their calibration. The defaults describe perfect
+    cameras."""
 
-    # Standard deviation of the depth at 1 m, in m; grows with the square of the depth, as for a
+    # Standard deviation of the depth at 1 m, in m. It grows with the square of the depth, as for a
     # stereo camera.
     depth_std: float = bounded(0.0, 0.0, 0.1)
 
     # Correlation length of the depth noise: radius of the smoothing kernel, in pixels.
     correlation: float = bounded(1.5, 0.0, 20.0)
 
-    # Quantization step of the depth at 1 m, in m; grows with the square of the depth.
+    # Quantization step of the depth at 1 m, in m. It grows with the square of the depth.
     depth_step: float = bounded(0.0, 0.0, 0.1)
 
     # Share of the pixels beside an edge that get a depth between its two sides.
@@ -60,11 +62,13 @@ class SensorNoiseParameters:
     # Standard deviation of the relative gain of each colour channel.
     white_balance_std: float = bounded(0.0, 0.0, 1.0)
 
-    # Error of each camera's calibrated pose, in m and degrees, in a random direction.
+    # Size of the error of each camera's calibrated pose, in m and in degrees; its direction is
+    # random.
     camera_position_error: float = bounded(0.0, 0.0, 0.1)
     camera_angle_error_deg: float = bounded(0.0, 0.0, 20.0)
 
-    # Error of the pose of all cameras together, in m and in degrees about the workspace's middle.
+    # Size of an error that all cameras share, as if their common mount had moved, in m and in
+    # degrees about the workspace's middle.
     rig_position_error: float = bounded(0.0, 0.0, 0.1)
     rig_angle_error_deg: float = bounded(0.0, 0.0, 20.0)
 
@@ -103,19 +107,22 @@ class SensorNoise(LeafSystem):
         - depth_image_32f
         - body_pose_in_world
 
-    The outputs have the sensor's names and types, to replace it in a diagram. The law:
+    The output ports have the names and types of the sensor's, so that this system can replace it in
+    a diagram. The law:
 
     - Depth z gets noise of standard deviation `depth_std (z / 1 m)^2`, smoothed over `correlation`
       pixels at constant variance, and is rounded to multiples of `depth_step (z / 1 m)^2`.
     - Beside an edge (a step of more than 15 mm between neighbours), a share `flying_share` of the
       pixels gets a depth between the two sides.
-    - Holes get depth 0 (Drake's too close). They are: blobs over `hole_share` of the image; blobs
-      over p percent of surfaces labelled SHEEN_LABELS + p, if `label_image` is connected; and
-      pixels seen at more than `steepest_deg` from the normal, outlines included.
+    - Holes get depth 0, which Drake's cameras return for objects that are too close. Holes are
+      blobs over `hole_share` of the image; blobs over p percent of surfaces labelled SHEEN_LABELS +
+      p, if `label_image` is connected; and pixels that see a surface at more than `steepest_deg`
+      from its normal, which includes outlines.
     - The output depth is the median of `frames` such images with independent noise.
     - Each colour channel is multiplied by a normally distributed gain of mean one.
     - `body_pose_in_world` is the *calibrated* pose, `X_Rig X_WB X_Camera`. Its errors have the
-      given sizes, in directions drawn once. The images are those of the true pose.
+      given sizes, in directions drawn once for each seed. The images show the view from the true
+      pose.
 
     All draws depend on the seed, the camera's number and the time (to the microsecond) only.
     Stateless: evaluating twice gives the same images.
@@ -136,8 +143,10 @@ class SensorNoise(LeafSystem):
             parameters: the parameters of the noise.
             camera: the sensor's depth camera.
             seed: the seed of all draws.
-            number: the number of the camera; the rig's error does not depend on it.
-            workspace_middle: (x, y) in the world about which the rig's error rotates, in metres.
+            number: number of the camera, so that each has its own noise; the cameras' shared error
+                does not depend on it.
+            workspace_middle: (x, y) in the world about which the cameras' shared error rotates, in
+                metres.
             use_labels: whether to declare the input port `label_image`.
         """
         super().__init__()
@@ -236,7 +245,7 @@ def noisy_depth(
     Args:
         depth: (height, width), in metres; 0 and infinity are invalid.
         parameters: the parameters of the noise.
-        camera: its intrinsics.
+        camera: the camera's intrinsics.
         random: the random generator of all draws.
         sheen: (height, width) share of holes on each surface; None for no sheen.
     """
@@ -250,7 +259,7 @@ def noisy_depth(
         hole |= _incidence(z, seen, camera) < math.cos(math.radians(parameters.steepest_deg))
     noisy = z
     if parameters.flying_share:
-        # Neighbours without a depth are ignored. If there are no others, the pixel keeps its depth.
+        # Ignore neighbours without a depth. A pixel that has only such neighbours keeps its depth.
         low, high = (
             np.where(seen, extreme(np.where(seen, z, none), 3), z)
             for extreme, none in (
@@ -287,17 +296,17 @@ def _incidence(
 
     Args:
         z: (height, width), depths in metres.
-        seen: (height, width), where the depth is valid.
-        camera: its intrinsics.
+        seen: (height, width) mask of the pixels with a valid depth.
+        camera: the camera's intrinsics.
     """
-    # Pixel centres are at half-integers, as in `heightmap.py`.
+    # Pixel centres are at half-integers.
     columns, rows = np.arange(z.shape[1]) + 0.5, np.arange(z.shape[0]) + 0.5
     x = ((columns - camera.center_x()) / camera.focal_x()).astype(np.float32)
     y = ((rows - camera.center_y()) / camera.focal_y()).astype(np.float32)[:, None]
     by_row, by_col = np.gradient(np.where(seen, z, np.float32(np.nan)))
     along_x, along_y = by_col * np.float32(camera.focal_x()), by_row * np.float32(camera.focal_y())
-    # The surface z (x, y, 1) has the normal (-dz/dx, -dz/dy, z + x dz/dx + y dz/dy). Its product
-    # with the ray (x, y, 1) is z.
+    # The surface z (x, y, 1) has the normal (-dz/dx, -dz/dy, z + x dz/dx + y dz/dy). The dot
+    # product of this normal with the ray (x, y, 1) is z.
     normal = np.sqrt(along_x**2 + along_y**2 + (z + x * along_x + y * along_y) ** 2)
     return z / (normal * np.sqrt(x**2 + y**2 + 1))
 
@@ -306,10 +315,11 @@ def median_depth(frames: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
     """The median of each pixel's valid depths over some images.
 
     Args:
-        frames: (height, width) each, in metres; 0 and infinity are invalid.
+        frames: the images, (height, width) each, in metres; 0 and infinity are invalid.
 
     Returns:
-        (height, width); a pixel that is never valid keeps its value in the first image.
+        (height, width) depths in metres. A pixel that is never valid keeps its value in the first
+        image.
     """
     stack = np.stack(frames)
     stack[~(np.isfinite(stack) & (stack > 0))] = np.nan
@@ -323,7 +333,8 @@ def median_depth(frames: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
 def _unit_field(
     random: np.random.Generator, shape: tuple[int, ...], radius: float
 ) -> NDArray[np.float32]:
-    """Normally distributed values of unit variance, smoothed by a Gaussian."""
+    """A field of normally distributed values, smoothed by a Gaussian of a radius in pixels and
+    scaled to unit variance."""
     values = random.standard_normal(shape, dtype=np.float32)
     if radius <= 0:
         return values

@@ -1,4 +1,4 @@
-"""The values that flow between the systems of the kitting cell.
+"""Types of the values that flow between the systems of the kitting cell.
 
 This module does not need pydrake, so that policies can be trained without Drake.
 """
@@ -32,13 +32,13 @@ class PixelGrid:
     resolution: float = 0.003125
     """Side of a pixel, in metres."""
     rows: int = 160
-    """Pixels along x."""
+    """Number of pixels along world x."""
     cols: int = 320
-    """Pixels along y."""
+    """Number of pixels along world y."""
     z_min: float = 0.0
-    """World height that reads as zero, in metres."""
+    """World z of the height zero in heightmaps, in metres."""
     z_max: float = 0.28
-    """Points above this world height are dropped, in metres."""
+    """Points above this world z are dropped, in metres."""
 
     def __post_init__(self) -> None:
         if self.rows < 1 or self.cols < 1 or self.resolution <= 0:
@@ -87,14 +87,16 @@ class Observation:
     pixels are zero in all four channels."""
     grid: PixelGrid = field(default_factory=PixelGrid)
     valid: NDArray[np.bool_] = None  # type: ignore[assignment]
-    """(rows, cols): pixels seen by some camera. Default: the pixels with a non-zero channel."""
+    """(rows, cols) mask of the pixels that some camera sees. Default: the pixels with a non-zero
+    channel."""
     in_view: NDArray[np.bool_] = None  # type: ignore[assignment]
-    """(rows, cols): pixels that some camera looks at, if nothing hides them. Default: all."""
+    """(rows, cols) mask of the pixels in some camera's field of view, whether or not something
+    hides them. Default: all pixels."""
     table: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """The table's plane, which was subtracted from the heights: at (row, col) it lay
     `table @ (row, col, 1)` metres above `grid.z_min`."""
     history: tuple[Attempt, ...] = ()
-    """The earlier actions of the episode, oldest first; empty where nobody records them."""
+    """The earlier actions of the episode, oldest first; empty if they are not recorded."""
 
     def __post_init__(self) -> None:
         if self.valid is None:
@@ -104,12 +106,12 @@ class Observation:
 
     @property
     def rgb(self) -> NDArray[np.float32]:
-        """(3, rows, cols), in [0, 1]."""
+        """(3, rows, cols) red, green and blue, in [0, 1]."""
         return self.image[:3]
 
     @property
     def height(self) -> NDArray[np.float32]:
-        """(rows, cols), metres above the table."""
+        """(rows, cols) heights in metres above the table."""
         return self.image[3]
 
     @cached_property
@@ -129,14 +131,14 @@ def fill_unseen(
 ) -> NDArray[np.float32]:
     """Fills the heights of unseen pixels.
 
-    A hidden surface is lower than what hides it, so a hole is filled with the lowest neighbour,
-    from its border inwards. What lies outside all views, or deep in a large hole, gets the table's
-    height, zero: nothing is known about it.
+    A hidden surface is lower than the surface that hides it, so a hole is filled with the lowest
+    neighbour, from its border inwards. Pixels outside all views, or deep in a large hole, get the
+    table's height, zero, because nothing is known about them.
 
     Args:
         height: (rows, cols), in metres above the table.
-        valid: (rows, cols), where the height was seen.
-        in_view: (rows, cols), where a camera looks; None for everywhere.
+        valid: (rows, cols) mask of the pixels with a measured height.
+        in_view: (rows, cols) mask of the pixels in a camera's field of view; None for all pixels.
     """
     if valid.all() or not valid.any():
         return height
@@ -167,7 +169,7 @@ class PlanarPose:
     y: float = 0.0
     """World y of the tool centre point, in metres."""
     theta: float = 0.0
-    """Radians."""
+    """Rotation about world +z, in radians."""
 
     def as_array(self) -> NDArray[np.float64]:
         """(x, y, theta)."""
@@ -186,7 +188,7 @@ class SurfaceHeights:
     support: float = 0.0
     """The surface that the object stands on."""
     place_rim: float = 0.0
-    """The highest surface around the place, e.g. the rim of a cavity."""
+    """The highest surface around the place, for example the rim of a cavity."""
     place_floor: float = 0.0
     """The lowest surface at the place, on which the object will stand."""
     near_pick: float = 0.0
@@ -196,11 +198,12 @@ class SurfaceHeights:
     highest: float = 0.0
     """The highest surface in the workspace."""
     table: float = 0.0
-    """The table; nothing goes below it."""
+    """The table; the hand never goes below it."""
     doubt: float = 0.0
     """The uncertainty of differences between these heights; zero if o_t has no noise or tilt."""
     width: float = math.inf
-    """The width at the pick for which open jaws have to make room; infinite if unknown."""
+    """The width, in the direction in which the jaws close, that the open jaws must clear at the
+    pick; infinite if unknown."""
 
 
 STOP_REASONS = {
@@ -212,7 +215,7 @@ STOP_REASONS = {
     "gave up": "what is left could not be done",
     "actions spent": "no actions are left",
 }
-"""Why no more actions follow, and what to tell a person."""
+"""Reasons why no more actions follow, each with a sentence for people."""
 
 
 @dataclass(frozen=True)
@@ -226,21 +229,22 @@ class PickPlaceAction:
     pick: PlanarPose = field(default_factory=PlanarPose)
     place: PlanarPose = field(default_factory=PlanarPose)
     stop: bool = False
-    """True: the task is finished, and the poses are ignored."""
+    """Whether the policy stops. The poses are then ignored."""
     reason: str = ""
-    """Why it stops, a word of `STOP_REASONS`; empty if unknown."""
+    """The reason for a stop, a key of `STOP_REASONS`; empty if unknown."""
     press: bool = False
-    """True: only push down at the pick with closed jaws; the place is ignored."""
+    """Whether the hand only pushes down at the pick with closed jaws. The place is then ignored."""
     aside: bool = False
-    """True: the object is laid on a free part of the table, not into its goal."""
+    """Whether the object is laid on a free part of the table instead of into its goal."""
     left_over: LeftOver | None = None
-    """What a stopping policy still sees; None if it does not tell."""
+    """The objects and cavities that a policy still sees when it stops; None if it does not report
+    them."""
     heights: SurfaceHeights | None = None
-    """None: the planner reads the heights off its own o_t."""
+    """Heights of the surfaces around pick and place. None: the planner reads them off o_t."""
 
     @property
     def poses(self) -> dict[str, PlanarPose]:
-        """The poses that this action uses, by name: none to stop, only the pick to press."""
+        """The poses that this action uses, by name. A stop uses none, a press only the pick."""
         if self.stop:
             return {}
         return {"pick": self.pick} if self.press else {"pick": self.pick, "place": self.place}
@@ -248,7 +252,8 @@ class PickPlaceAction:
 
 @dataclass(frozen=True)
 class LeftOver:
-    """What a stopping policy sees: objects that are not placed, cavities that are not filled."""
+    """The objects that are not placed, and the cavities that are not filled, when a policy
+    stops."""
 
     objects: tuple[tuple[float, float], ...] = ()
     """World (x, y) of each object's middle, in metres."""
@@ -265,17 +270,17 @@ because it cannot reach the poses."""
 
 @dataclass(frozen=True)
 class Attempt:
-    """An earlier action and how it ended, as the robot itself can tell."""
+    """An earlier action and its outcome, as far as the robot's own sensors show it."""
 
     action: PickPlaceAction
-    """Without heights."""
+    """The action, without heights."""
     outcome: str
     """A word of `OUTCOMES`."""
     peak_force: float = 0.0
     """The largest contact force on the hand, in N, without the weight of the held object."""
     balance: tuple[float, float] | None = None
-    """World (x, y) of the centre of mass along the pads that the hand felt before it set the object
-    down, in metres; None for any other outcome."""
+    """World (x, y), in metres, of the object's centre of mass, as far as its position along the
+    pads was measured before the object was set down; None for any other outcome."""
 
 
 def wrap_to_pi(angle: float) -> float:

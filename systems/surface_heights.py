@@ -27,11 +27,12 @@ _TABLE_SHARE = 5.0
 _CLEAN = 0.0003
 """A smaller standard deviation counts as no noise, in metres."""
 _LEAST_FLAT = 500
-"""The least number of flat squares that tell whether there is noise."""
+"""Least number of flat squares that is enough to decide whether there is noise."""
 _SMOOTHED = 9
-"""Noise is the deviation from the mean over a square of so many pixels."""
+"""Side, in pixels, of the squares over which heights are averaged; noise is the deviation from this
+average."""
 _FLAT = 0.012
-"""Squares with a larger range of heights contain edges and are not flat, in metres."""
+"""Squares whose heights range over more than this, in metres, contain edges and are not flat."""
 _NOISY_RIM_SHARE, _NOISY_RIM_BIAS = 90.0, 1.0
 """Percentile of the heights around a place that estimates its rim's height, and its bias in
 standard deviations. About two thirds of these pixels belong to the rim."""
@@ -39,15 +40,16 @@ _NOISY_FLOOR_SHARE, _NOISY_FLOOR_BIAS = 25.0, -0.67
 """Percentile of the heights at a place that estimates its floor's height, and its bias in standard
 deviations."""
 _SUNK = 0.003
-"""A table that looks too low by more than this is taken to be lower, in metres."""
+"""A table that looks lower than expected by more than this, in metres, is assumed to be lower."""
 _TILT_DOUBT, _MOST_DOUBT = 0.3, 0.0025
-"""Uncertainty after levelling: this share of the table's deviation, and its maximum in metres."""
+"""The uncertainty of heights after levelling is this share of the table's deviation, but at most
+the second number, in metres."""
 
 
 def read_surface_heights(
     observation: Observation, pick: PlanarPose, place: PlanarPose
 ) -> SurfaceHeights:
-    """The surface heights around a pick and a place, from o_t alone.
+    """Reads the surface heights around a pick and a place off o_t.
 
     - Unseen pixels are filled in (`fill_unseen`).
     - An object's support is a low percentile of the heights around it. An object in the middle of
@@ -56,8 +58,8 @@ def read_surface_heights(
       If o_t is noisy, medians and percentiles are used instead, corrected for their bias.
     - The table is assumed to be level and at the bottom of the grid. If it looks tilted or shifted
       in o_t, this counts as a calibration error, and `project` has subtracted it.
-    - A table that looks more than 3 mm too low is an exception: it is taken to be lower. Guarded
-      motions stop at a contact, so they may aim too low, but must not end too high.
+    - A table that looks more than 3 mm lower than expected is an exception: it is assumed to be
+      lower. Motions that stop at a contact may aim too low, but must not end too high.
 
     Args:
         observation: o_t.
@@ -118,7 +120,8 @@ def _deviation(observation: Observation) -> float:
 
 
 def _sunk(observation: Observation, pixel: NDArray[np.float64]) -> float:
-    """How much the table is lower than the bottom of the grid at a (row, col): 0 or negative."""
+    """Height of the table relative to the bottom of the grid at a (row, col), in metres, if it is
+    assumed to be lower; else 0."""
     level = float(np.array(observation.table) @ np.append(pixel, 1.0))
     return level if level < -_SUNK else 0.0
 
@@ -135,7 +138,7 @@ def _noise(height: NDArray[np.float32]) -> float:
     away = np.abs(height - ndimage.uniform_filter(height, _SMOOTHED, mode="nearest"))
     highest = ndimage.maximum_filter(height, _SMOOTHED, mode="nearest")
     flat = highest - ndimage.minimum_filter(height, _SMOOTHED, mode="nearest") < _FLAT
-    # Flat squares have less noise than average, so they only tell whether there is any.
+    # Flat squares have less noise than average, so use them only to decide whether there is any.
     if flat.sum() >= _LEAST_FLAT and 1.4826 * np.median(away[flat]) < _CLEAN:
         return 0.0
     noise = 1.4826 * float(np.median(away))

@@ -8,14 +8,15 @@ from numpy.typing import NDArray
 _STEP = 2
 """Only every second row and column is used."""
 _LEAST = 200
-"""The least number of such pixels on the table."""
+"""Least number of these pixels that must lie on the table."""
 _LEAST_SHARE = 0.15
-"""The least share of such pixels on the table among those that are seen."""
+"""Least share of the seen pixels that must lie on the table."""
 _BIN = 0.001
 _FAR = 0.03
 """The table is sought within this distance of the bottom of the grid, in metres."""
 _BAND = 0.004
-"""Pixels within this distance of a plane belong to it, in metres, or three times the noise."""
+"""Pixels within this distance of a plane, in metres, or within three times the noise if that is
+more, belong to it."""
 _FITS = 8
 _LEVEL = 0.0003
 """A table with smaller deviations counts as level, in metres."""
@@ -29,13 +30,12 @@ def level(
     """Subtracts the table's plane from a heightmap.
 
     Args:
-        height: (rows, cols), in metres above the bottom of the grid; may be negative.
-        seen: (rows, cols), the pixels that may belong to the table.
+        height: (rows, cols) heights in metres above the bottom of the grid; may be negative.
+        seen: (rows, cols) mask of the pixels that may belong to the table.
         resolution: the side of a pixel, in metres.
 
     Returns:
-        (rows, cols): the heights above the table.
-        The plane (see `find_table`).
+        (rows, cols) heights above the table, and the plane that was subtracted (see `find_table`).
     """
     table = find_table(height, seen, resolution)
     if not any(table):
@@ -48,15 +48,16 @@ def level(
 def find_table(
     height: NDArray[np.float32], seen: NDArray[np.bool_], resolution: float
 ) -> tuple[float, float, float]:
-    """The table's plane in a heightmap: its height at (row, col) is `plane @ (row, col, 1)`.
+    """Finds the table's plane in a heightmap. The table's height at (row, col) is `plane @
+    (row, col, 1)`.
 
-    The plane starts at the lowest frequent height, and is refitted to the pixels near it. It is
-    zero if it deviates by less than 0.3 mm, if it is not near the bottom of the grid, or if no
-    plane is found.
+    The search starts with a level plane at the lowest frequent height, and refits it to the pixels
+    near it. The result is zero if the plane deviates by less than 0.3 mm, if it is not near the
+    bottom of the grid, or if no plane is found.
 
     Args:
-        height: (rows, cols), in metres above the bottom of the grid; may be negative.
-        seen: (rows, cols), the pixels to use.
+        height: (rows, cols) heights in metres above the bottom of the grid; may be negative.
+        seen: (rows, cols) mask of the pixels to use.
         resolution: the side of a pixel, in metres.
     """
     none = (0.0, 0.0, 0.0)
@@ -71,7 +72,7 @@ def find_table(
         [rows * _STEP - middle[0], cols * _STEP - middle[1], np.ones(len(rows))]
     )
     plane = np.array([0.0, 0.0, _lowest_mode(values[near])])
-    # Begin in the middle, where a tilt matters least.
+    # Begin with the pixels in the middle, where a tilt changes the height least.
     reach = np.abs(design[:, :2]).max(axis=1)
     noise = 0.0
     for number in range(_FITS):
@@ -96,10 +97,10 @@ def find_table(
 
 
 def _lowest_mode(values: NDArray[np.float64]) -> float:
-    """The lowest frequent height."""
+    """The position of the lowest peak in the histogram of heights, in metres."""
     counts = np.bincount(((values + _FAR) / _BIN).astype(int), minlength=int(2 * _FAR / _BIN) + 1)
     smooth = np.convolve(counts, np.ones(5), "same")
     first = int(np.flatnonzero(smooth >= 0.5 * smooth.max())[0])
-    # The peak's maximum is at most a kernel's width beyond its rise.
+    # The maximum of a peak is at most one kernel width above the point where the peak begins.
     highest = first + int(smooth[first : first + 5].argmax())
     return (highest + 0.5) * _BIN - _FAR

@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 HAND_AXES = 4
-"""x, y, z and yaw of the point midway between the fingertips."""
+"""Number of the hand's axes: x, y, z and yaw of the point midway between the fingertips."""
 FINGERS = 2
 
 
 @dataclass(frozen=True)
 class FingerLaw:
-    """The force of each finger's drive.
+    """Computes the force of each finger's drive.
 
     With the opening w = q_L + q_R (closed at zero), the desired one w_d and the closing force f,
 
@@ -26,19 +26,19 @@ class FingerLaw:
     """
 
     stiffness: float
-    """k_w, in N/m."""
+    """Stiffness k_w, in N/m."""
     damping: float
-    """d_w, in N s/m."""
+    """Damping d_w, in N s/m."""
     force_limit: float
-    """f_max, in N."""
+    """Largest force f_max of a finger's drive, in N."""
 
     def force(self, state: Sequence[float], opening: Sequence[float], closing: float) -> float:
-        """u_finger in N.
+        """The force u_finger, in N.
 
         Args:
-            state: q_L, q_R and their rates, in m and m/s.
-            opening: w_d and its rate, in m and m/s.
-            closing: f, in N.
+            state: positions q_L and q_R of the fingers and their rates, in m and m/s.
+            opening: desired opening w_d and its rate, in m and m/s.
+            closing: closing force f, in N.
         """
         left, right, left_rate, right_rate = state
         wanted, rate = opening
@@ -66,7 +66,7 @@ class TrajectoryController(LeafSystem):
 
     - `hand_state` (12): positions then velocities of (x, y, z, yaw, left finger, right finger), in
       m, rad, m/s, rad/s: the state of the hand's model instance.
-    - `desired_motion` (12): q_d, v_d, a_d of (x, y, z, yaw).
+    - `desired_motion` (12): positions q_d, velocities v_d and accelerations a_d of (x, y, z, yaw).
     - `desired_opening` (2): opening w_d between the pads in m, and its rate in m/s.
     - `closing_force` (1): f, the force of each pad *in addition to* the force that holds the
       opening, in N; zero if not connected.
@@ -94,15 +94,15 @@ class TrajectoryController(LeafSystem):
         force_limit: NDArray[np.float64],
         fingers: FingerLaw,
     ) -> None:
-        """All arrays are (4): x, y, z, yaw.
+        """All arrays have 4 elements, for x, y, z and yaw.
 
         Args:
-            inertia: M, in kg and kg m^2.
+            inertia: effective inertia M of each axis, in kg and kg m^2.
             weight: gravity on the moving mass, in N, held by the z axis.
-            stiffness: k_p, in N/m and N m/rad.
-            damping: k_d, in N s/m and N m s/rad.
-            force_limit: u_max, in N and N m.
-            fingers: the law of the fingers.
+            stiffness: stiffness k_p, in N/m and N m/rad.
+            damping: damping k_d, in N s/m and N m s/rad.
+            force_limit: largest force u_max, in N and N m.
+            fingers: the control law of the fingers.
 
         Raises:
             ValueError: an array has the wrong size, or a limit is not positive.
@@ -134,7 +134,7 @@ class TrajectoryController(LeafSystem):
         self.DeclareVectorOutputPort("actuation", HAND_AXES + FINGERS, self._calc_actuation)
 
     def _calc_actuation(self, context: Context, output: BasicVector) -> None:
-        # Plain floats: this runs at every step, and NumPy is slower for four elements.
+        # Use plain floats: this runs at every step, and NumPy is slower for four elements.
         state = self._hand_state.Eval(context).tolist()
         desired = self._desired_motion.Eval(context).tolist()
         forces = []

@@ -9,7 +9,8 @@ from systems.arm_trajectory import ArmTrajectory
 
 
 class TrajectorySource(LeafSystem):
-    """A trajectory as the planner's outputs to the controller.
+    """Plays a joint trajectory through the same output ports that the planner has for the
+    controller.
 
     .. pydrake_system::
 
@@ -19,10 +20,11 @@ class TrajectorySource(LeafSystem):
         - desired_opening
         - closing_force
 
-    - `desired_motion` (21): q_d, v_d, a_d of the joints: `ArmTrajectory.at` the context's time.
-    - `desired_opening` (2): the opening between the pads in m, and its rate: a ramp to the width of
-      the last command to the jaws, at its speed.
-    - `closing_force` (1): the force of the last command, in N.
+    - `desired_motion` (21): positions q_d, velocities v_d and accelerations a_d of the joints: the
+      result of `ArmTrajectory.at` at the context's time.
+    - `desired_opening` (2): the opening between the pads in m, and its rate in m/s. The opening
+      ramps to the width of the last jaw command, with the command's speed.
+    - `closing_force` (1): the force of the last jaw command, in N.
 
     The arm rests before the start and after the end. Stateless.
     """
@@ -30,7 +32,7 @@ class TrajectorySource(LeafSystem):
     def __init__(self, trajectory: ArmTrajectory) -> None:
         """
         Args:
-            trajectory: starts at time zero.
+            trajectory: the trajectory to play; it starts at time zero.
         """
         super().__init__()
         self._trajectory = trajectory

@@ -1,4 +1,5 @@
-"""Named, typed fields of a state vector, like pydrake's `namedview` but for type checkers."""
+"""Defines named fields of a state vector, like pydrake's `namedview`, but visible to type
+checkers."""
 
 from __future__ import annotations
 
@@ -45,7 +46,8 @@ class Array:
 
 
 class VectorView:
-    """A view of a vector. A subclass declares its fields in the order of the elements:
+    """Gives names to the elements of a vector. A subclass declares its fields in the order of the
+    elements:
 
     class HandState(VectorView):
         position = Array(4)
@@ -58,7 +60,7 @@ class VectorView:
     """Number of elements of the vector."""
 
     def __init_subclass__(cls) -> None:
-        # The fields of a subclass follow those of its base, whose size it inherits.
+        # The fields of a subclass follow those of its base class, whose size it inherits.
         for field in list(vars(cls).values()):
             if isinstance(field, Number | Array):
                 field.index = cls.size

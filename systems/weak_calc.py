@@ -1,4 +1,4 @@
-"""Callbacks of output ports that do not keep their system alive."""
+"""Creates callbacks of output ports that do not keep their system alive."""
 
 import weakref
 from collections.abc import Callable
@@ -16,8 +16,9 @@ def weak_calc(method: Callable[..., None], *first: Any) -> Callable[[Context, Ab
     (Drake 1.51 keeps them alive in any case.)
 
     Args:
-        method: a bound method that takes `first`, a Context and the output's value.
-        first: its first arguments.
+        method: a bound method of the system. Its arguments are `first`, a Context and the output's
+            value.
+        first: values of the method's first arguments.
     """
     reference = weakref.WeakMethod(method)
 

@@ -11,11 +11,11 @@ from systems.arm_limits import JOINTS
 from systems.trajectory_controller import FINGERS
 
 _STREAM = 17
-"""Random stream of the seed, used by nothing else."""
+"""Number of this module's random stream, which NumPy gets together with the seed."""
 
 
 class WristForce(LeafSystem):
-    r"""The contact force on the hand, from external joint torques.
+    r"""Estimates the contact force on the hand from external joint torques.
 
     .. pydrake_system::
 
@@ -27,12 +27,13 @@ class WristForce(LeafSystem):
         output_ports:
         - wrist_force
 
-    - `robot_state` (18): as in `JointController`.
+    - `robot_state` (18): positions of the seven joints and both fingers, then their velocities.
     - `joint_contact_torque` (7): tau, the torques that contacts cause in the joints, in N m. A
-      Franka estimates them: measured torques less those that its model explains.
+      Franka estimates them as the measured torques minus those that its dynamics model predicts.
     - `finger_contact_force` (2): the contact forces on the fingers' joints, in N.
-    - `wrist_force` (6): contact forces on x, y, z (N), about z (N m), and on each finger (N), at
-      the gripper frame G and in the world's axes: the `PickPlacePlanner`'s `hand_contact_force`.
+    - `wrist_force` (6): contact forces along x, y, z (N), the moment about z (N m), and the force
+      on each finger (N), at the gripper frame G and in the world's axes. It is the input
+      `hand_contact_force` of the `PickPlacePlanner`.
 
     The spatial force F on the hand at G solves, in the sense of least squares,
 
@@ -56,16 +57,16 @@ class WristForce(LeafSystem):
     ) -> None:
         """
         Args:
-            arm: a plant of nothing but the arm and its hand, at its place in the world; the joints
-                come before the fingers.
-            gripper: G, a frame of that plant.
-            step: h, in s.
+            arm: a plant that contains only the arm and its hand, at its pose in the world; the
+                joints come before the fingers.
+            gripper: the frame G of that plant.
+            step: time step h of the controlled plant, in s.
             noise: the standard deviation of n, in N m.
             seed: the seed of the noise.
         """
         super().__init__()
         self._arm, self._gripper = arm, gripper
-        # Scratch memory: no value outlives the call that sets it.
+        # Scratch memory: each call overwrites the values before it reads them.
         self._scratch = arm.CreateDefaultContext()
         self._step, self._noise, self._seed = step, noise, seed
         size = JOINTS + FINGERS
@@ -80,7 +81,7 @@ class WristForce(LeafSystem):
     def _calc_force(self, context: Context, output: BasicVector) -> None:
         torque = self._torque.Eval(context)
         if self._noise > 0:
-            # A context's time is a multiple of the plant's step, so that this names the step.
+            # The time in microseconds identifies the step, and so seeds its noise.
             moment = round(1e6 * context.get_time())
             rng = np.random.default_rng([self._seed, _STREAM, moment])
             torque = torque + rng.normal(0.0, self._noise, JOINTS)
@@ -97,6 +98,6 @@ class WristForce(LeafSystem):
         jacobian = arm.CalcJacobianSpatialVelocity(
             self._scratch, JacobianWrtVariable.kV, self._gripper, np.zeros(3), world, world
         )[:, :JOINTS]
-        # The normal equations: J has full rank where the hand points down.
+        # Solve the normal equations; J has full rank while the hand points down.
         _, _, about_z, x, y, z = np.linalg.solve(jacobian @ jacobian.T, jacobian @ torque).tolist()
         return [x, y, z, about_z]
