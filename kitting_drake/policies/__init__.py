@@ -1,1 +1,1 @@
-"""Policies: their demonstrations, networks and losses. Nothing here imports pydrake."""
+"""Policies, their training data, networks and training. Nothing here imports pydrake."""

@@ -1,8 +1,9 @@
-"""The probability that a decided pick and place succeeds.
+"""Estimates the probability that a pick and place succeeds.
 
-It is a logistic regression on what is known about the decision: the networks' certainty, the fit of
-the outlines, the room for the jaws, and how much is seen. `benchmark reliability` fits it to scenes
-with random cameras that no network was trained on. This is not in the paper.
+The estimate is a logistic regression on facts about the decision: the networks' certainty, how well
+the outlines of object and recess fit, the room for the jaws, and how much is seen. `benchmark
+reliability` fits it to scenes with random cameras that no network was trained on. This is not in
+the paper.
 """
 
 from __future__ import annotations
@@ -26,33 +27,34 @@ if TYPE_CHECKING:
     from kitting_drake.policies.learned_policy import Decision
 
 FILE = MODELS / "policies" / "confidence.json"
-"""The fitted regressions, by policy."""
+"""The file of the fitted regressions, one for each kind of policy."""
 _SAME_PICK = 0.010
-"""Probability within this distance of the pick supports it, in metres ..."""
+"""Probability that the networks assign to pixels within this distance of the pick supports the
+pick, in metres."""
 _OTHER_PICKS = 0.060
-"""... and probability within this distance belongs to the same object."""
+"""Probability within this distance of the pick is taken to belong to the same object, in metres."""
 _SAME_ANGLE = math.radians(10)
-"""Probability within this angle of the pick's angle supports it, in radians."""
+"""Probability within this angle of the chosen pick angle supports the angle, in radians."""
 
 
 @dataclass(frozen=True)
 class Reliability:
-    """A fitted regression."""
+    """A fitted logistic regression and the threshold for its result."""
 
     weights: dict[str, float]
-    """By name of the fact; '' is the constant."""
+    """Weights by the name of the fact; the empty name is the constant term."""
     threshold: float
-    """The least confidence with which to act."""
+    """The least confidence at which the robot acts."""
 
     def confidence(self, evidence: Evidence) -> float:
-        """The probability of success, from 0 to 1."""
+        """The estimated probability of success, from 0 to 1."""
         total = self.weights[""]
         total += sum(self.weights[name] * value for name, value in evidence.items())
         return 1 / (1 + math.exp(-max(-30.0, min(total, 30.0))))
 
 
 def read_reliability(policy: str, weights: Path | None = None) -> Reliability:
-    """A fitted regression.
+    """Reads a fitted regression.
 
     Args:
         policy: `networks` or `shape_matching`.
@@ -73,7 +75,7 @@ def _read(path: Path, policy: str) -> Reliability:
 
 
 def evidence_of_networks(observation: Observation, decision: Decision) -> Evidence:
-    """The facts about a networks' decision that is not a stop."""
+    """Collects the facts about a decision of the networks that is not a stop."""
     parts = certainty(decision, observation.grid.resolution)
     return {
         "something_to_pick": float(np.clip(decision.log_odds or 0.0, -8, 8)),
@@ -87,13 +89,14 @@ def evidence_of_networks(observation: Observation, decision: Decision) -> Eviden
 
 
 def certainty(decision: Decision, resolution: float) -> dict[str, float]:
-    """The networks' certainty in a decision, as shares of their own probabilities.
+    """How certain the networks are of a decision, from the probabilities that they predict.
 
-    - `something_to_pick`, or for a stop `nothing_to_pick`: the probability by alpha's stop class,
-      if it has one;
-    - `pick`: of alpha's probability within 6 cm of the pick, the share within 1 cm. Other objects
-      that could be picked as well do not lower it;
-    - `angle`: beta's probability within 10 degrees of the pick's angle.
+    - `something_to_pick`, or for a stop `nothing_to_pick`: the probability from the stop class of
+      the pick-position network alpha, if it has one;
+    - `pick`: of the probability that alpha assigns within 6 cm of the pick, the share within 1 cm.
+      Other objects that could be picked just as well do not lower it;
+    - `angle`: the probability that the pick-angle network beta assigns within 10 degrees of the
+      chosen angle.
     """
     parts: dict[str, float] = {}
     if decision.log_odds is not None:

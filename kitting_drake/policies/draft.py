@@ -1,4 +1,4 @@
-"""A decision while it is made: the networks' proposal, which the stages then refine."""
+"""A decision in progress: the networks' proposal, which the stages then refine."""
 
 from __future__ import annotations
 
@@ -39,15 +39,15 @@ _NEVER = -math.inf
 def network_input(
     networks: Networks, observation: Observation, resolution: float | None = None
 ) -> Image:
-    """The networks' input: (4, rows, cols).
+    """Prepares the networks' input, (4, rows, cols), from an observation.
 
-    Networks that see heights alone get unseen pixels filled in. If their pixels in training had
-    another size, heights are scaled with the pixels: a scene of half the size, seen with pixels of
-    half the size, then looks the same.
+    For networks that see only heights, unseen pixels are filled in. If such networks were trained
+    with pixels of another size, heights are scaled by the ratio of the sizes. A scene of half the
+    size, seen with pixels of half the size, then looks the same.
 
     Args:
-        networks: for inference.
-        observation: o_t.
+        networks: networks that are prepared for inference.
+        observation: the heightmap o_t.
         resolution: the side of a pixel in training, in metres; None if unknown.
     """
     if networks.config.colour:
@@ -59,7 +59,7 @@ def network_input(
 
 
 class Look:
-    """One observation with everything that is computed from it once."""
+    """One observation, together with all results that are computed from it only once."""
 
     def __init__(
         self,
@@ -71,10 +71,10 @@ class Look:
     ) -> None:
         """
         Args:
-            networks: for inference.
-            orientations: N.
-            observation: o_t.
-            failed_picks: poses at which a grasp failed before.
+            networks: networks that are prepared for inference.
+            orientations: N, the number of orientations.
+            observation: the heightmap o_t.
+            failed_picks: gripper poses at which a grasp failed before.
             resolution: the side of a pixel in training, in metres; None if unknown.
         """
         self.networks = networks
@@ -91,12 +91,12 @@ class Look:
 
     @cached_property
     def inventory(self) -> Inventory:
-        """The objects and recesses of o_t, and which belong together."""
+        """The objects and recesses of o_t, and the pairs of them that fit."""
         return Inventory.of(self.observation)
 
     @property
     def segmentation(self) -> Segmentation:
-        """The segmentation of o_t by height, with touching objects told apart."""
+        """The segmentation of o_t by height, in which touching objects are separated."""
         return self.inventory.segmentation
 
     @cached_property
@@ -113,10 +113,10 @@ class Look:
 
 
 class Stage(Protocol):
-    """One stage of a decision. It keeps no state between decisions."""
+    """One step of the refinement of a decision. It keeps no state between decisions."""
 
     def refine(self, draft: Draft) -> Draft:
-        """The refined draft, or the same draft where the stage does not apply."""
+        """Returns the refined draft, or the same draft if the stage does not apply."""
         ...
 
 
@@ -130,42 +130,43 @@ class Draft:
     logits: Tensor
     """(rows, cols): the logits of the pick, -inf where it is excluded."""
     pixel: tuple[int, int]
-    """(row, col) of the largest logit. The networks see the crops around it."""
+    """(row, col) of the largest logit. The networks' crops are centred on it."""
     angles: AnglePrediction
     """The predicted pick angle at `pixel`."""
     placing: PlacePrediction
     """The predicted placements of the object at `pixel`."""
     pick: Array
-    """(row, col)."""
+    """(row, col) of the pick, which may lie between pixels."""
     theta: float
     """The gripper's angle at the pick, in radians."""
     rotation: float
     """The object's rotation from pick to place, in radians."""
     goal: Array
-    """The predicted (row, col) of the place for `pixel`."""
+    """The predicted (row, col) to which the object's point at `pixel` goes."""
     continuous: bool = False
-    """Whether positions and angles are refined beyond pixels and bins."""
+    """Whether positions and angles are refined beyond the networks' pixels and bins."""
     outlined: bool = False
     """Whether a stage compared the outlines of object and recess."""
     grasp_cost: float | None = None
-    """See `JawGrasp.cost`; None if no feasible grasp is known."""
+    """The cost of the grasp, see `JawGrasp.cost`; None if no feasible grasp is known."""
     fit_cost: float | None = None
     """The mean difference of the outlines of object and recess, in metres; None if they do not
     fit."""
     fitted: Array | None = None
-    """(row, col) of the place by the outlines of object and recess; None where they do not fit."""
+    """(row, col) of the place at which the outlines of object and recess fit; None if they do not
+    fit."""
     belongs: bool = False
     """Whether the outlines show that the object belongs at this place."""
     stop: bool = False
-    """Whether there is nothing left to pick, or nothing that is seen well enough."""
+    """Whether the policy stops: nothing is left to pick, or nothing is seen well enough."""
     reason: str = ""
-    """Why it stops; see `PickPlaceAction.reason`."""
+    """Why the policy stops; see `PickPlaceAction.reason`."""
     mending: PickPlaceAction | None = None
-    """An action that mends an earlier one and replaces this draft."""
+    """An action that corrects an earlier failure and replaces this draft; None if there is none."""
 
     @property
     def place(self) -> Array:
-        """(row, col) of the place for the pick.
+        """(row, col) of the place, to which the object's point at `pick` goes.
 
         Without a fitted place, the motion predicted for `pixel` is applied to the refined pick.
         """
@@ -180,7 +181,7 @@ class Draft:
     def among(self, mask: Mask) -> Draft | None:
         """The draft of the best pick within a mask (rows, cols), after the same stages.
 
-        None where the mask leaves no pixel to pick.
+        Returns None if the mask leaves no pixel to pick.
         """
         left = _without(self.logits, ~mask)
         if not bool((left > _NEVER).any()):
@@ -189,12 +190,12 @@ class Draft:
 
 
 def make_draft(look: Look, logits: Tensor, stages: Sequence[Stage]) -> Draft:
-    """The networks' best action, passed through all stages.
+    """Returns the networks' best action after all stages have refined it.
 
     Args:
-        look: the observation.
-        logits: (rows, cols), of the pick.
-        stages: in the order in which they are applied.
+        look: the observation and the networks.
+        logits: (rows, cols) logits of the pick position.
+        stages: the stages, in the order in which they are applied.
     """
     row, col = divmod(int(logits.argmax()), logits.shape[1])
     angles = look.picking.angle((row, col))
@@ -233,11 +234,11 @@ def expected_position(logits: Tensor, pixel: tuple[int, int]) -> Array:
     Networks trained with interpolated labels (see `losses`) predict this mean.
 
     Args:
-        logits: (rows, cols).
+        logits: (rows, cols) logits of positions.
         pixel: (row, col) of the maximum.
 
     Returns:
-        (row, col).
+        (row, col) of the mean position.
     """
     return _local_mean(logits[None], (0, *pixel))[1:]
 
@@ -245,7 +246,8 @@ def expected_position(logits: Tensor, pixel: tuple[int, int]) -> Array:
 def best_placement(
     candidate: Candidate, orientations: int, continuous: bool
 ) -> tuple[float, Array]:
-    """A candidate's rotation in radians and position (row, col), refined if `continuous`."""
+    """The best rotation, in radians, and position (row, col) of a candidate, refined if
+    `continuous`."""
     _, rotation, row, col = candidate.best()
     found = np.array([rotation, row, col], float)
     if continuous:
@@ -256,12 +258,12 @@ def best_placement(
 
 
 def _without(logits: Tensor, mask: Mask) -> Tensor:
-    """The logits, -inf within the mask."""
+    """Returns the logits with -inf at the pixels of the mask."""
     return logits.masked_fill(torch.from_numpy(mask).to(logits.device), _NEVER)
 
 
 def _local_mean(logits: Tensor, index: tuple[int, int, int]) -> Array:
-    """The mean index under the softmax over an entry and its neighbours."""
+    """The mean index, under the softmax over an entry and its neighbours."""
     starts = [max(i - 1, 0) for i in index]
     part = logits[
         starts[0] : index[0] + 2, starts[1] : index[1] + 2, starts[2] : index[2] + 2

@@ -1,4 +1,4 @@
-"""Makes the policies, for the simulated cell and for real cameras. Does not import Drake."""
+"""Makes policies for the simulated cell and for real cameras. This module does not import Drake."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 _LARGEST_RATIO = 3.0
-"""Pixels may be this much larger or smaller than in training."""
+"""Largest allowed ratio, in either direction, between the sizes of pixels now and in training."""
 
 
 @dataclass(frozen=True)
@@ -32,20 +32,20 @@ class LoadedPolicy:
     resolution: float | None
     """The side of the pixels in training, in metres; None if the file does not give it."""
     colour: bool
-    """Whether it sees colours; otherwise heights alone."""
+    """Whether the policy sees colours; otherwise it sees only heights."""
 
     def check_grid(self, grid: PixelGrid, field: str) -> None:
-        """Checks that the policy can use observations of this grid.
+        """Checks that the policy can use observations with a given pixel grid.
 
-        Networks that see heights alone can use pixels of another size than in training (see
-        `network_input`), others cannot.
+        Networks that see only heights can use pixels of another size than in training (see
+        `network_input`). Networks that see colours cannot.
 
         Args:
             grid: the pixel grid of the observations.
-            field: the caller's name of the grid's resolution, for the error.
+            field: the caller's name for the grid's resolution, used in error messages.
 
         Raises:
-            UserError: the policy cannot use it.
+            UserError: the policy cannot use this size of pixels.
         """
         learned, given = self.resolution, grid.resolution
         if learned is None or math.isclose(given, learned, rel_tol=1e-6):
@@ -53,7 +53,7 @@ class LoadedPolicy:
         advice = f"but the policy in {self.path.name} learned from pixels of {learned:g} m"
         if self.colour:
             raise UserError(
-                f"{field} is {given:g} m, {advice}: use that size, or train another policy"
+                f"{field} is {given:g} m, {advice}: use {learned:g} m, or train another policy"
             )
         if not 1 / _LARGEST_RATIO <= given / learned <= _LARGEST_RATIO:
             raise UserError(
@@ -75,19 +75,19 @@ def load_learned_policy(
     may_stop: bool = True,
     watch: Callable[[Observation, Decision], None] | None = None,
 ) -> LoadedPolicy:
-    """A policy of trained networks.
+    """Loads a policy with trained networks.
 
     Args:
-        weights: a file that `train` wrote; None for the generalist.
-        planner: how the hand will pick and place.
+        weights: a file that `train` wrote; None for the weights that come with the package.
+        planner: parameters of the motion with which the hand will pick and place.
         insertion: whether objects are inserted into recesses.
-        orientations: N.
-        orientations_field: the caller's name of `orientations`, for errors.
+        orientations: N, the number of orientations.
+        orientations_field: the caller's name for `orientations`, used in error messages.
         continuous: see `make_stages`.
         fit_outlines: see `make_stages`.
         recover: see `make_stages`.
         may_stop: see `make_stages`.
-        watch: called with each observation and decision.
+        watch: if given, a function that is called with each observation and decision.
 
     Raises:
         UserError: the file is unusable, or the networks do not support N orientations.
@@ -125,11 +125,11 @@ def load_learned_policy(
 def make_shape_matching(
     planner: PickPlaceParameters, *, recover: bool = False
 ) -> ShapeMatchingPolicy:
-    """The training-free policy.
+    """Makes the policy that needs no training.
 
     Args:
-        planner: how the hand will pick and place.
-        recover: whether to correct failed insertions.
+        planner: parameters of the motion with which the hand will pick and place.
+        recover: whether the policy corrects failed insertions.
     """
     # Import SciPy lazily.
     from kitting_drake.policies.matching.shape_matching import ShapeMatchingPolicy

@@ -21,41 +21,44 @@ from kitting_drake.policies.stages import StopRule, SubPixel
 from systems.signals import LeftOver, Observation, PickPlaceAction, PlanarPose
 
 _ELSEWHERE = 8.0
-"""Places farther apart than this are different, in pixels."""
+"""Places farther apart than this count as different, in pixels."""
 _MOST_MARGIN = 20.0
-"""The largest margin of a place's score over another, in nats."""
+"""Upper limit of `Decision.place_margin`, in nats."""
 
 
 @dataclass(frozen=True)
 class Decision:
-    """An action and the distributions behind it."""
+    """An action, and the predicted distributions from which it was chosen."""
 
     action: PickPlaceAction
-    """With `stop` set, it still holds the action that the policy would have taken otherwise."""
+    """The action. If its `stop` is set, its poses are those that the policy would have chosen
+    otherwise."""
     pick_map: NDArray[np.float32]
     """(rows, cols): p(u, v), the picking module's probabilities."""
     angle_curve: NDArray[np.float32]
     """(n,): p(theta | u, v) at the angles pi i / n."""
     place_map: NDArray[np.float32]
-    """(rows, cols): the best score over all rotations relative to the maximum, in nats; coarse."""
+    """(rows, cols): the best score over all rotations, relative to the maximum, in nats, from a
+    coarse search."""
     pick_pixel: NDArray[np.float64]
-    """(row, col)."""
+    """(row, col) of the pick."""
     place_pixel: NDArray[np.float64]
-    """(row, col)."""
+    """(row, col) of the place."""
     log_odds: float | None = None
     """The log-odds that there is something to pick; None if the networks do not predict it."""
     belongs: bool = False
     """Whether the outlines show that the object belongs at its place."""
     moved_pick: float = 0.0
-    """How far the stages moved the pick, in mm."""
+    """How far the stages moved the pick from the networks' proposal, in mm."""
     moved_place: float = 0.0
-    """How far they moved the place, in mm."""
+    """How far the stages moved the place from the networks' proposal, in mm."""
     geometry: Evidence = dataclasses.field(default_factory=dict)
-    """Geometric facts about the action (`geometric_evidence`), if outlines are used."""
+    """Geometric facts about the action (`geometric_evidence`); empty if outlines are not used."""
     kit_seen: bool | None = None
     """Whether o_t shows a kit; None if outlines are not used."""
     place_margin: float = 0.0
-    """How much worse the best other place scores, in nats."""
+    """The difference between the scores of the chosen place and of the best other place, in
+    nats."""
 
     @property
     def stop(self) -> bool:
@@ -68,7 +71,7 @@ DEFAULT_STAGES: tuple[Stage, ...] = (SubPixel(), StopRule())
 
 
 class LearnedPolicy:
-    """Networks and the stages that refine their proposal. It has no memory."""
+    """A policy of networks and of stages that refine the networks' proposal. It has no memory."""
 
     def __init__(
         self,
@@ -82,11 +85,11 @@ class LearnedPolicy:
         """
         Args:
             networks: for inference. `StopRule` uses their `stop_threshold`.
-            orientations: N.
-            stages: applied in order (see `make_stages`). With no stages this is the paper's
-                policy, whose actions are pixels and bins.
+            orientations: N, the number of orientations.
+            stages: the stages, in the order in which they are applied (see `make_stages`). Without
+                stages this is the paper's policy, whose actions are quantized to pixels and bins.
             resolution: the side of a pixel in training, in metres; None if unknown.
-            watch: called with each observation and decision.
+            watch: if given, a function that is called with each observation and decision.
 
         Raises:
             ValueError: the networks do not support N orientations.
@@ -101,18 +104,19 @@ class LearnedPolicy:
     def __call__(
         self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()
     ) -> PickPlaceAction:
-        """The action; both gripper poses are in the world.
+        """Returns the action; both gripper poses are in the world.
 
         Args:
-            observation: o_t.
-            failed_picks: poses at which a grasp failed before; it avoids them.
+            observation: the heightmap o_t.
+            failed_picks: gripper poses at which a grasp failed before; they are avoided.
         """
         return self.act(observation, failed_picks)[0]
 
     def act(
         self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()
     ) -> tuple[PickPlaceAction, Decision | None]:
-        """The action and its decision; the decision is None for an action that mends another.
+        """Returns the action and its decision. The decision is None for an action that corrects an
+        earlier failure.
 
         The arguments are those of `__call__`.
         """
@@ -129,7 +133,8 @@ class LearnedPolicy:
         return decision.action, decision
 
     def decide(self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()) -> Decision:
-        """The networks' action and the distributions behind it; it never mends an earlier action.
+        """Returns the networks' action and its distributions, without corrections of earlier
+        failures.
 
         The arguments are those of `__call__`.
         """
@@ -173,7 +178,7 @@ def _decision(draft: Draft) -> Decision:
 def _left_over(draft: Draft) -> LeftOver | None:
     """The objects and recesses that a stopping policy still sees.
 
-    None if the policy goes on, or does not use outlines.
+    Returns None if the policy continues, or does not use outlines.
     """
     return draft.look.inventory.left_over if draft.stop and draft.outlined else None
 
@@ -199,7 +204,8 @@ def _told(draft: Draft) -> dict[str, Any]:
 
 
 def _place_margin(draft: Draft) -> float:
-    """How much worse the best place elsewhere (more than `_ELSEWHERE` away) scores, in nats."""
+    """The difference between the scores of the best place and of the best place more than
+    `_ELSEWHERE` away from it, in nats."""
     candidates = draft.placing.candidates
     best, _, row, col = candidates[0].best()
     others = [

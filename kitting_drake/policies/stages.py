@@ -1,7 +1,7 @@
 """The stages that refine the networks' decision.
 
-Each takes a `Draft` and returns it refined. The paper has none of them: it quantizes every action
-and never stops.
+Each stage takes a `Draft` and returns a refined one. The paper has no such stages: it quantizes
+every action and never stops.
 """
 
 from __future__ import annotations
@@ -24,17 +24,18 @@ from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import wrap_to_pi
 
 _AS_GOOD = 2.0
-"""Rotations within this of the best score count as equally good, in nats, ..."""
+"""Rotations whose score is within this of the best count as equally good, in nats, if their places
+are also close together."""
 _SAME_PLACE = 4.0
-"""... if their places are at most this far apart, in pixels."""
+"""Places at most this far apart count as close together, in pixels."""
 _TRIES = 4
-"""How many picks are tried, at most, to find one that is seen."""
+"""The largest number of picks that are tried to find one that is seen well enough."""
 _ANOTHER = 0.010
-"""The next pick to try is farther than this from the last one, in metres."""
+"""The next pick to try is at least this far from the last one, in metres."""
 _NOTHING_FITS = 2.0
-"""The shift of the stop threshold when the outlines show nothing worth a try, in nats.
+"""How much the stop threshold is raised if the outlines show nothing to pick, in nats.
 
-Networks and outlines both err among distractors, but seldom at the same time.
+Among distractors both the networks and the outlines may be wrong, but seldom at the same time.
 """
 
 
@@ -50,12 +51,13 @@ def make_stages(
     """The stages of a policy's decisions. The arguments are the fields of `!Learned` in a scenario.
 
     Args:
-        planner: how the hand will pick and place.
+        planner: parameters of the motion with which the hand will pick and place.
         insertion: whether objects are inserted into recesses. Outlines are used only then.
-        continuous: refine actions beyond pixels and bins.
-        fit_outlines: with `continuous`, also refine them by the geometry of o_t.
-        recover: mend failed insertions.
-        may_stop: stop when there is nothing left to pick.
+        continuous: whether to refine actions beyond the networks' pixels and bins.
+        fit_outlines: whether to refine actions by the geometry of o_t as well; used only with
+            `continuous`.
+        recover: whether to correct failed insertions.
+        may_stop: whether to stop when there is nothing left to pick.
     """
     outlines = insertion and continuous and fit_outlines
     stages: list[Stage] = []
@@ -76,7 +78,7 @@ def make_stages(
 
 @dataclass(frozen=True)
 class SubPixel:
-    """Refines positions to sub-pixels and angles to sub-bins."""
+    """Refines positions to less than a pixel and angles to less than a bin."""
 
     def refine(self, draft: Draft) -> Draft:
         refined = draft.angles.refined
@@ -92,7 +94,8 @@ class SubPixel:
 
 @dataclass(frozen=True)
 class JawRoom:
-    """Moves a grasp that leaves the jaws no room to one that does (`refine_grasp`)."""
+    """Replaces a grasp at which the jaws have no room by one at which they have room
+    (`refine_grasp`)."""
 
     planner: PickPlaceParameters
 
@@ -117,8 +120,8 @@ class JawRoom:
 class OutlinePlace:
     """Fits the place to the outlines of object and recess where they agree.
 
-    It begins at the networks' place (`refine_place`). If that fails, it takes the recess into
-    which the object fits (`Inventory.pairs`), if there is one.
+    The fit starts at the networks' place (`refine_place`). If it fails, the stage uses the recess
+    into which the object fits (`Inventory.pairs`), if there is one.
     """
 
     def refine(self, draft: Draft) -> Draft:
@@ -159,7 +162,7 @@ class OutlinePlace:
 class ReleaseRoom:
     """Chooses the rotation that leaves the fingers most room at release (`blocked_at_place`).
 
-    It chooses only among rotations that score equally well: a cube has four of them.
+    It chooses only among rotations that score equally well. A cube, for example, has four of them.
     """
 
     planner: PickPlaceParameters
@@ -188,7 +191,8 @@ class ReleaseRoom:
 
 @dataclass(frozen=True)
 class BelongingFirst:
-    """Picks first what belongs into a recess (`Inventory.pairs`), then what was not tried yet."""
+    """Picks first the objects that fit into a recess (`Inventory.pairs`), then those that may
+    contain such an object (`Inventory.worth_a_try`)."""
 
     def refine(self, draft: Draft) -> Draft:
         inventory = draft.look.inventory
@@ -204,7 +208,7 @@ class BelongingFirst:
                     break
                 if found.grasp_cost is not None:
                     return found
-                # The jaws have no room at this object.
+                # The jaws have no room at this object, so try the next.
                 blocked = nearest_region(regions, found.pick)
                 regions = tuple(item for item in regions if item is not blocked)
         return draft
@@ -223,13 +227,13 @@ class StopRule:
 
 @dataclass(frozen=True)
 class OutlineStop:
-    """Stops when nothing is left to do, by the networks and by the outlines.
+    """Stops when both the networks and the outlines show that nothing is left to do.
 
     - An object that fits into a recess is picked, whatever the networks say.
-    - One that was not tried yet and may hide something that fits is picked if the networks see
-      something to pick: their log-odds are above the threshold.
-    - Anything else is picked only if they are much above it, and never an object that lies on the
-      wrong face.
+    - A region that may contain such an object (`Inventory.worth_a_try`) is picked if the networks'
+      log-odds of something to pick are above the threshold.
+    - Any other object is picked only if the log-odds are far above the threshold. An object that
+      lies upside down is never picked.
     """
 
     def refine(self, draft: Draft) -> Draft:
@@ -250,11 +254,12 @@ class OutlineStop:
 
 @dataclass(frozen=True)
 class SeenOnly:
-    """Picks and places only where o_t shows enough (`Visibility`); otherwise stops."""
+    """Picks and places only where enough of o_t is seen (see `Visibility`). If there is no such
+    action, stops."""
 
     planner: PickPlaceParameters
     outlines: bool = True
-    """Whether objects are told apart by their outlines."""
+    """Whether the segmentation of o_t into objects is used."""
 
     def refine(self, draft: Draft) -> Draft:
         visibility = Visibility.of(draft.look.observation)
@@ -270,7 +275,7 @@ class SeenOnly:
             allowed = allowed & (away * found.look.resolution > _ANOTHER)
             region = self._region(found)
             if number % 2 and region is not None:
-                # Another pick of the same object did not help: try another object.
+                # A second pick of the same object did not help, so try another object.
                 allowed = allowed & ~region.mask
             found = draft.among(allowed)
         if draft.stop:
@@ -286,7 +291,7 @@ class SeenOnly:
         return visibility.place_is_seen(footprint, draft.pick, draft.rotation, draft.place)
 
     def _region(self, draft: Draft) -> Region | None:
-        """The object under the pick, if objects are told apart."""
+        """The object under the pick; None if the segmentation is not used."""
         if not self.outlines:
             return None
         return nearest_region(draft.look.segmentation.objects, draft.pick)
@@ -294,11 +299,11 @@ class SeenOnly:
 
 @dataclass(frozen=True)
 class Recovery:
-    """Mends a failed insertion (`recovery_action`), takes heaps apart (`separating_action`), and
+    """Corrects failed insertions (`recovery_action`), takes heaps apart (`separating_action`), and
     turns objects over (`turning_action`).
 
-    It presses a protruding object down at once. It does the others only when nothing else belongs
-    into a recess, because they cost actions.
+    It presses a protruding object down at once. The other corrections cost actions, so they come
+    only when no other object fits into a recess.
     """
 
     planner: PickPlaceParameters

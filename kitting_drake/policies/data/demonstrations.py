@@ -1,4 +1,5 @@
-"""Demonstrations: an expert's episodes of (o_t, a_pick, a_place) in one HDF5 file.
+"""Demonstrations: an expert's episodes, as observations o_t and actions (a_pick, a_place), in one
+HDF5 file.
 
 The file's attributes are `format`, `format_version`, `first_seed`, `scenario_name` and, as JSON,
 `scenario`, `grid`, `learning`, `versions` and `rejected`. Each demonstration of T steps is a group,
@@ -6,7 +7,7 @@ such as `seed_00010000`, with the attributes `seed` and `score` and the datasets
 
 - `rgb` (T, 3, rows, cols), 8 bits, and `height` (T, rows, cols), metres: the observations,
 - `pick` and `place` (T, 3), x and y in metres and theta in radians: the actions,
-- `object` and `category` (T,): the picked object,
+- `object` and `category` (T,): names of the picked object and of its category,
 - `final_rgb` (3, rows, cols) and `final_height` (rows, cols): the observation with nothing left to
   do. They are absent if the episode ended before the hand was ready for another action.
 
@@ -47,11 +48,12 @@ class Demonstration:
     """The share of the objects that were placed."""
     steps: tuple[DemonstrationStep, ...]
     final: FinalObservation | None = None
-    """The observation at the end; missing if the hand was not ready for another action by then."""
+    """The observation at the end; None if the episode ended before the hand was ready for another
+    action."""
     commit: str | None = None
-    """The commit of the code that ran it; None if unknown."""
+    """The commit of the code that ran the episode; None if unknown."""
     digest: str | None = None
-    """The digest of its group in the file; None if it was not read from a file."""
+    """The digest of the demonstration's group in the file; None if it was not read from a file."""
 
 
 @dataclass(frozen=True)
@@ -65,28 +67,29 @@ class Rejection:
 
 @dataclass(frozen=True)
 class Origin:
-    """The origin of demonstrations."""
+    """The scenario and the software that made demonstrations."""
 
     scenario_name: str
     scenario: dict[str, Any]
     """The scenario's fields as JSON values."""
     grid: PixelGrid
     first_seed: int
-    """The demonstrations are of successive seeds from this one on, without the rejected ones."""
+    """The first seed. The demonstrations have consecutive seeds from this one on, except for
+    rejected seeds."""
     versions: dict[str, str]
-    """The package versions that made the latest of them."""
+    """Versions of the packages that made the latest demonstrations."""
     learning: Learning = field(default_factory=Learning)
-    """The assumptions that the task allows in training."""
+    """The assumptions that the task allows training to make."""
 
 
 @dataclass(frozen=True)
 class Demonstrations:
-    """The contents of a file."""
+    """The contents of a file of demonstrations."""
 
     origin: Origin
     rejected: tuple[Rejection, ...]
     demonstrations: tuple[Demonstration, ...]
-    """In the order of their seeds."""
+    """The demonstrations, in the order of their seeds."""
 
 
 @dataclass(frozen=True)
@@ -97,14 +100,14 @@ class Contents:
     rejected: tuple[Rejection, ...]
     seeds: tuple[int, ...]
     commits: tuple[str, ...] = ()
-    """The recorded commits of the code that made them."""
+    """The recorded commits of the code that made the demonstrations."""
 
 
 def read_demonstrations(path: Path, first: int | None = None) -> Demonstrations:
     """Reads and checks a file of demonstrations; its images stay in the file (see `Stored`).
 
     Args:
-        path: the file.
+        path: path of the file.
         first: how many to read, in the order of their seeds; None for all.
 
     Raises:
@@ -179,7 +182,7 @@ def _group_name(seed: int) -> str:
 
 @contextlib.contextmanager
 def _created(path: Path, origin: Origin, rejected: Iterable[Rejection]) -> Iterator[h5py.File]:
-    """A new file of demonstrations, which is moved into place when it is complete."""
+    """Yields a new file of demonstrations, and moves it into place when it is complete."""
     scratch = path.with_name(f".{path.name}.scratch")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -196,7 +199,7 @@ def _created(path: Path, origin: Origin, rejected: Iterable[Rejection]) -> Itera
             yield file
         os.replace(scratch, path)
     except (OSError, RuntimeError) as error:
-        # HDF5 raises RuntimeError if the disk is full when it closes the file.
+        # If the disk is full, HDF5 raises RuntimeError when it closes the file.
         reason = getattr(error, "strerror", None) or error
         raise UserError(f"cannot write {path}: {reason}") from error
     finally:
@@ -236,8 +239,8 @@ def _opened(path: Path, *, keep: bool = False) -> Iterator[h5py.File]:
     """Opens a file of demonstrations, turning any failure into a UserError.
 
     Args:
-        path: the file.
-        keep: leave the file open as long as its datasets are in use.
+        path: path of the file.
+        keep: whether to leave the file open as long as its datasets are in use.
     """
     if not path.is_file():
         raise UserError(f"there is no file {path}: make it with python -m kitting_drake.collect")
@@ -255,7 +258,7 @@ def _opened(path: Path, *, keep: bool = False) -> Iterator[h5py.File]:
             if version != FORMAT_VERSION:
                 raise UserError(
                     f"{path} has format version {version}, but version {FORMAT_VERSION} is needed: "
-                    "use the kitting_drake that made it, or collect again"
+                    "use the version of kitting_drake that made it, or collect again"
                 )
             yield file
     except UserError:
@@ -324,7 +327,8 @@ def _read_group(group: h5py.Group, grid: PixelGrid) -> Demonstration:
 
 
 def _checked(group: h5py.Group, name: str, shape: tuple[int, ...], digest: Any) -> h5py.Dataset:
-    """A dataset of the given shape with finite entries; its content is added to a digest."""
+    """Returns a dataset after a check of its shape and for finite entries. Adds its content to a
+    digest."""
     dataset = group[name]
     values = dataset[()]
     if values.shape != shape:

@@ -1,4 +1,5 @@
-"""Episodes as frames at a fixed rate: camera images, joints and commands, for learners of today.
+"""Episodes as frames at a fixed rate, with camera images, joints and commands, for imitation
+learning.
 
 The names are those of LeRobot datasets, and of the environments in `kitting_drake.gym` that take
 joint targets.
@@ -20,13 +21,14 @@ from kitting_drake.common.files import write_atomically
 STATE = "observation.state"
 ACTION = "action"
 GRIPPER = "gripper"
-"""The last entry of state and action. State: the opening between the pads, in m. Action: the
-opening that the fingers' springs pull towards. Below the width of the held object it grips, and
-negative values grip more firmly."""
+"""The name of the last entry of states and actions. In a state it is the opening between the pads,
+in m. In an action it is the opening towards which the fingers' springs pull, in m. An opening
+smaller than the held object grips it, and a negative one grips more firmly."""
 RATES = range(10, 31)
 """Permitted frames per second."""
 DEFAULT_RATE = 16
-"""Divides the 128 steps of a second, so that frames are equally far apart."""
+"""Default number of frames per second. It divides the 128 simulation steps of a second, so that
+frames are equally far apart."""
 DEFAULT_WIDTH = 160
 
 
@@ -55,14 +57,15 @@ class FrameSettings:
             raise UserError(f"image_width is {self.width}: use at least 16")
 
     def size(self, width: int, height: int) -> tuple[int, int]:
-        """Width and height of the recorded images of a camera, in pixels: the same shape, not
-        enlarged."""
+        """Width and height of a camera's recorded images, in pixels. They have the camera's aspect
+        ratio and are never larger than its images."""
         scale = min(1.0, self.width / width)
         return max(1, round(scale * width)), max(1, round(scale * height))
 
 
 def reduce_image(image: NDArray[np.uint8], recording: FrameSettings) -> NDArray[np.uint8]:
-    """An image (height, width, 3) at the recorded size; each pixel is the mean of its area."""
+    """Reduces an image (height, width, 3) to the recorded size. Each pixel is the mean of the area
+    that it covers."""
     height, width = image.shape[:2]
     size = recording.size(width, height)
     if size == (width, height):
@@ -71,7 +74,7 @@ def reduce_image(image: NDArray[np.uint8], recording: FrameSettings) -> NDArray[
 
 
 def encode_png(image: NDArray[np.uint8]) -> bytes:
-    """An image (height, width, 3) as PNG."""
+    """Encodes an image (height, width, 3) as PNG."""
     content = io.BytesIO()
     Image.fromarray(np.ascontiguousarray(image)).save(content, "PNG")
     return content.getvalue()
@@ -79,18 +82,18 @@ def encode_png(image: NDArray[np.uint8]) -> bytes:
 
 @dataclass
 class EpisodeFrames:
-    """The frames of an episode, n of them."""
+    """The n frames of an episode."""
 
     seed: int
     fps: int
     names: tuple[str, ...]
-    """The entries of state and action: the joints that move the hand, then `GRIPPER`."""
+    """Names of the entries of states and actions: the joints that move the hand, then `GRIPPER`."""
     state: NDArray[np.float32]
-    """(n, entries) measured; m and rad."""
+    """(n, entries) measured positions, in m and rad."""
     action: NDArray[np.float32]
-    """(n, entries) the command that holds when the next frame is taken."""
+    """(n, entries) commanded positions, in m and rad, at the time of the next frame."""
     reward: NDArray[np.float32]
-    """(n) the task's reward earned until the next frame."""
+    """(n) the task's reward that is earned between a frame and the next."""
     success: NDArray[np.bool_]
     """(n) whether every goal is filled at the next frame."""
     images: dict[str, list[bytes]] = field(default_factory=dict)

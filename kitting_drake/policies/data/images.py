@@ -1,4 +1,4 @@
-"""Labelled images, their crops, and data augmentation.
+"""Labelled images, crops of them, and data augmentation.
 
 As in `systems.signals.PixelGrid`, positions are continuous (row, col) with pixel centres at whole
 numbers, and rotations are counter-clockwise.
@@ -20,10 +20,10 @@ Image = NDArray[np.float32]
 """(4, rows, cols): red, green, blue in [0, 1] and height in metres."""
 
 _CURVATURE_STD = 0.2
-"""The standard deviation of both coefficients of a curvature."""
+"""The standard deviation of both coefficients of a random curvature (see `curved_crop`)."""
 _FARTHEST_CURVED = 1.4
-"""The distance from the pick at which displacements stop growing, in half sides of the crop. The
-crop's corners are that far away."""
+"""The distance from the pick beyond which the displacements of a curved crop stop growing, in half
+sides of the crop. It is the distance of the crop's corners."""
 _ROTATION_STD = math.radians(60)
 """The standard deviation of augmentation's rotations in radians, as in the authors' code."""
 _SHIFT_STD = 1 / 6
@@ -36,16 +36,16 @@ class Pictured(Protocol):
 
     @property
     def image(self) -> Image:
-        """(4, rows, cols)."""
+        """The image, (4, rows, cols): red, green, blue in [0, 1] and height in metres."""
 
 
 @dataclass(frozen=True)
 class LabelledImage:
-    """An observation and the expert's action, in pixels."""
+    """An observation and the expert's action in it, in pixels."""
 
     image: Image
     pick: NDArray[np.float64]
-    """(row, col)."""
+    """(row, col) of the pick."""
     pick_theta: float
     """The gripper's angle in radians; adding pi gives the same grasp."""
     place: NDArray[np.float64]
@@ -59,11 +59,12 @@ class LabelledImage:
     motion: Motion | None = None
     """The motion that augmented the image; None without augmentation."""
     curvatures: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2)))
-    """(1 + n, 2): a curvature for the object of each pick (see `curved_crop`), or empty."""
+    """(1 + n, 2): a curvature for the object of each pick (see `curved_crop`); empty if there is
+    none."""
 
     @classmethod
     def from_action(cls, image: Image, action: PickPlaceAction, grid: PixelGrid) -> LabelledImage:
-        """The labels of an action."""
+        """Converts an action in the world to labels in pixels."""
         return cls(
             image=image,
             pick=grid.to_pixel((action.pick.x, action.pick.y)),
@@ -104,7 +105,7 @@ class LabelledImage:
         source = np.stack([along, across], axis=-1) @ axes.T + picks[index]
         if self.motion is None:
             return nearest(self.image, source)
-        # One lookup in the original image, to resample only once.
+        # Look up all pixels in the original image, so that it is resampled only once.
         rows, cols = self.image.shape[1:]
         inside = ((source > -0.5) & (source < (rows - 0.5, cols - 0.5))).all(axis=-1)
         return nearest(self.motion.image, self.motion.before(source)) * inside
@@ -122,10 +123,10 @@ def make_action(
     The planner reads the heights from the observation.
 
     Args:
-        observation: o_t.
-        pick: (row, col).
+        observation: the heightmap o_t.
+        pick: (row, col) at which the object is gripped.
         theta: the angle of the gripper at the pick, in radians.
-        place: (row, col).
+        place: (row, col) to which the gripped point goes.
         rotation: the rotation of the object from pick to place, in radians.
     """
     grid = observation.grid
@@ -145,13 +146,13 @@ class Motion:
     image: Image
     """The image before the motion."""
     angle: float
-    """Counter-clockwise, in radians."""
+    """The angle of the rotation, counter-clockwise, in radians."""
     shift: NDArray[np.float64]
-    """(row, col), in pixels."""
+    """The shift along rows and columns, in pixels."""
 
     @classmethod
     def draw(cls, image: Image, random: np.random.Generator) -> Motion:
-        """A random motion, normally distributed."""
+        """Draws a random motion, whose angle and shift are normally distributed."""
         rows, cols = image.shape[1:]
         angle = random.normal(0.0, _ROTATION_STD)
         return cls(image, angle, random.normal(0.0, (rows * _SHIFT_STD, cols * _SHIFT_STD)))
@@ -197,7 +198,8 @@ def crop(image: Image, centre: tuple[int, int], side: int) -> Image:
 
 
 def nearest(image: Image, source: NDArray[np.float64]) -> Image:
-    """An image resampled by nearest neighbours: interpolation would invent heights between objects.
+    """Resamples an image by nearest neighbours, because interpolation would invent heights between
+    objects.
 
     Args:
         image: (channels, rows, cols).
@@ -213,12 +215,12 @@ def nearest(image: Image, source: NDArray[np.float64]) -> Image:
 
 
 def move(sample: LabelledImage, angle: float, shift: NDArray[np.float64]) -> LabelledImage:
-    """A sample after a motion of the scene, with exact labels.
+    """Returns a sample after a motion of its scene, with exact labels.
 
     Args:
         sample: the sample.
         angle: the angle of the rotation about the image's centre, counter-clockwise, in radians.
-        shift: (row, col), in pixels.
+        shift: the shift along rows and columns, in pixels.
     """
     return _moved(sample, Motion(sample.image, angle, np.asarray(shift, float)))
 
@@ -267,14 +269,15 @@ def augment(
 ) -> LabelledImage:
     """A sample after a random SE(2) motion of the scene that keeps both labels inside the image.
 
-    Motions are drawn until one does; after a hundred failed draws the sample is not moved.
+    Motions are drawn until one keeps them inside. After a hundred failed draws the sample is not
+    moved.
 
     Args:
         sample: the sample.
-        random: the random generator of all draws.
-        curvature: also draw curvatures (see `LabelledImage.curved_crop`), to learn pick angles from
-            bent objects. Not in the paper.
-        reflection: reflect every other sample first. Not in the paper.
+        random: the generator of all random draws.
+        curvature: whether to draw curvatures as well (see `LabelledImage.curved_crop`), so that
+            pick angles are learned from bent objects. This is not in the paper.
+        reflection: whether to reflect every other sample first. This is not in the paper.
     """
     if reflection and random.random() < 0.5:
         sample = reflect(sample)

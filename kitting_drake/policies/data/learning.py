@@ -1,4 +1,5 @@
-"""The assumptions that a task allows in training. Imports neither Drake nor torch."""
+"""The assumptions that a task allows training to make. This module imports neither Drake nor
+torch."""
 
 from __future__ import annotations
 
@@ -13,15 +14,16 @@ class Learning:
     """
 
     later_picks_possible: bool = False
-    """Objects can be picked in any order. Every later pick of a demonstration then also labels its
-    earlier observations. True for kitting, false for stacking."""
+    """Whether objects can be picked in any order. Every later pick of a demonstration then also
+    labels its earlier observations. True for kitting, false for stacking."""
     curvature: bool = False
-    """Objects may be bent in the image to augment pick angles: they come in slightly different
-    shapes, and bent ones are picked alike. True for hand tools, false for blocks."""
+    """Whether objects may be bent in the image, as data augmentation for pick angles. This requires
+    that the task's objects differ slightly in shape, and that a bent one is picked in the same way.
+    True for hand tools, false for blocks."""
     reflection: bool = False
-    """Mirror images of scenes are valid scenes of the task, and their objects are handled alike.
-    True for hand tools of many shapes."""
+    """Whether the mirror image of a scene is a valid scene of the task, in which the mirrored
+    action is right. True for hand tools of many shapes."""
     many_answers: bool = False
-    """The expert's action is one of several equally right ones: objects are symmetric, or places
-    are interchangeable. A checkpoint is then chosen by the losses, because errors against the
-    expert say little. True for blocks, false for hand tools."""
+    """Whether several actions are equally right, because objects are symmetric or places are
+    interchangeable. Deviations from the expert's action then say little, so a checkpoint is chosen
+    by its losses. True for blocks, false for hand tools."""

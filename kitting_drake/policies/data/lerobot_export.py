@@ -1,4 +1,4 @@
-"""Frames of episodes as a LeRobotDataset v3.0, which LeRobot loads without conversion.
+"""Exports frames of episodes as a LeRobotDataset v3.0, which LeRobot loads without conversion.
 
 See docs/learning.md, and https://huggingface.co/docs/lerobot/lerobot-dataset-v3 for the format:
 Parquet files of frames (`data/`) and of episodes (`meta/episodes/`), tasks (`meta/tasks.parquet`),
@@ -42,23 +42,26 @@ Track = Callable[[Sequence[Path]], Iterable[Path]]
 """Iterates over files and shows progress, as `rich.progress.track` does."""
 
 _MOST_MEASURED = 50
-"""So many images of an episode enter the statistics, evenly spaced."""
+"""At most this many images of an episode, evenly spaced, are used for the statistics."""
 _MEGABYTES = 100
-"""The largest size of a file of frames, LeRobot's default; the next episode begins a new file."""
+"""The size at which the next episode begins a new file of frames, in megabytes. It is LeRobot's
+default."""
 _FILES_PER_CHUNK = 1000
 _DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 _RECORD = Path("meta", "kitting_drake.json")
 
 
 def require_export(folder: Path) -> None:
-    """Checks before new demonstrations are made that they can be exported.
+    """Checks, before new demonstrations are made, that they can be exported.
 
     Raises:
         UserError: pyarrow is not installed, or the folder exists.
     """
     require_pyarrow()
     if folder.exists():
-        raise UserError(f"{folder} already exists, without the new demonstrations: delete it")
+        raise UserError(
+            f"{folder} already exists and does not contain the new demonstrations: delete it"
+        )
 
 
 def export_lerobot(
@@ -77,8 +80,8 @@ def export_lerobot(
     Args:
         sources: files of `EpisodeFrames`, with equal rates, names and cameras.
         folder: the new dataset.
-        task: the instruction to policies, in words.
-        robot: the robot's name.
+        task: the task as an instruction in words, which policies may read.
+        robot: the robot's name; None if it is not given.
         about: further values for `meta/kitting_drake.json`.
         track: shows progress over the files.
 
@@ -97,7 +100,7 @@ def export_lerobot(
         raise UserError(f"{folder} exists but is not an export of these episodes: delete it")
     scratch = folder.with_name(f".{folder.name}.scratch")
     try:
-        # Remove what a killed process left.
+        # Remove the files of a process that was killed.
         shutil.rmtree(scratch, ignore_errors=True)
         (scratch / "meta").mkdir(parents=True)
         _write(pyarrow, scratch, sources, task, robot, track)
@@ -144,7 +147,7 @@ def features(first: EpisodeFrames) -> dict[str, dict[str, Any]]:
 
 
 def decode(picture: bytes) -> NDArray[np.uint8]:
-    """(height, width, 3) of a PNG."""
+    """Decodes a PNG to an image (height, width, 3)."""
     return np.asarray(Image.open(io.BytesIO(picture)))
 
 
@@ -248,7 +251,7 @@ def _statistics(
 
 
 def _write_tasks(pyarrow: ModuleType, path: Path, task: str) -> None:
-    """Writes the tasks as a pandas table, which LeRobot indexes by task."""
+    """Writes the table of tasks in the form of a pandas table, with the task as index."""
     table = pyarrow.table({"task_index": pyarrow.array([0], pyarrow.int64()), "task": [task]})
     column = {"metadata": None, "pandas_type": "int64", "numpy_type": "int64"}
     text = {"metadata": None, "pandas_type": "unicode", "numpy_type": "object"}
@@ -268,12 +271,12 @@ def _write_tasks(pyarrow: ModuleType, path: Path, task: str) -> None:
 
 
 def _columns(read: EpisodeFrames, number: int, first: int) -> dict[str, Any]:
-    """An episode's frames by feature.
+    """Returns an episode's frames as one column for each feature.
 
     Args:
         read: the episode.
-        number: its index.
-        first: the index of its first frame.
+        number: index of the episode.
+        first: index of the episode's first frame in the dataset.
     """
     frame = np.arange(len(read))
     return {
@@ -292,14 +295,14 @@ def _columns(read: EpisodeFrames, number: int, first: int) -> dict[str, Any]:
 
 
 class _DataFiles:
-    """The files of `data/`, with one row group per episode."""
+    """Writes the files of `data/`, with one Parquet row group per episode."""
 
     def __init__(self, pyarrow: ModuleType, folder: Path, described: dict[str, Any]) -> None:
         self._pyarrow = pyarrow
         self._folder = folder
         self._described = described
         kinds = {name: self._type(feature) for name, feature in described.items()}
-        # The package datasets recognizes image columns by the schema's metadata.
+        # The package `datasets` recognizes image columns by the schema's metadata.
         named = {name: _hugging_face(feature) for name, feature in described.items()}
         metadata = {"huggingface": json.dumps({"info": {"features": named}})}
         self._schema = pyarrow.schema(kinds, metadata=metadata)
@@ -347,7 +350,7 @@ class _DataFiles:
 
 
 def _hugging_face(feature: dict[str, Any]) -> dict[str, Any]:
-    """A feature in the format of the package datasets."""
+    """A feature in the format of the package `datasets`."""
     if feature["dtype"] == "image":
         return {"_type": "Image"}
     value = {"dtype": feature["dtype"], "_type": "Value"}

@@ -1,4 +1,4 @@
-"""The normalisation statistics of a LeRobotDataset (see `lerobot_export`).
+"""Computes the normalisation statistics of a LeRobotDataset (see `lerobot_export`).
 
 They equal those of `lerobot.datasets.compute_stats`, but use every pixel of an image instead of a
 subset.
@@ -16,12 +16,13 @@ QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 
 
 def statistics_of(values: NDArray[Any], *, image: bool) -> dict[str, NDArray[Any]]:
-    """LeRobot's statistics of a feature over the frames, and pixels, of an episode.
+    """LeRobot's statistics of a feature over all frames of an episode, and for images over all
+    pixels.
 
     Args:
         values: (frames,), (frames, entries) or (frames, rows, cols, channels).
-        image: whether it is an image. Its statistics have the shape (channels, 1, 1), and 8-bit
-            values are scaled to [0, 1].
+        image: whether the feature is an image. Its statistics then have the shape (channels, 1, 1),
+            and 8-bit values are scaled to [0, 1].
     """
     flat = values.reshape(-1, values.shape[-1] if values.ndim > 1 else 1)
     samples = flat.astype(np.float64) / (255 if image and values.dtype == np.uint8 else 1)
@@ -38,8 +39,8 @@ def statistics_of(values: NDArray[Any], *, image: bool) -> dict[str, NDArray[Any
 
 
 def aggregate(episodes: Sequence[dict[str, NDArray[Any]]]) -> dict[str, Any]:
-    """The statistics of all episodes, as by LeRobot's `aggregate_stats`: a quantile is the mean of
-    the episodes' quantiles, weighted by their frames."""
+    """The statistics of all episodes together, computed as LeRobot's `aggregate_stats` does. A
+    quantile is the mean of the episodes' quantiles, weighted by their numbers of frames."""
     counts = np.array([item["count"][0] for item in episodes])
     stacked = {name: np.stack([item[name] for item in episodes]) for name in episodes[0]}
 

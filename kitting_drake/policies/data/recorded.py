@@ -22,17 +22,18 @@ class Stored:
 
     file: h5py.File
     dataset: str
-    """The name of a dataset. An open dataset would cache what was read in memory."""
+    """The name of the dataset. The dataset is opened for each access, because an open one would
+    cache its data in memory."""
     shape: tuple[int, ...]
     """The array's shape."""
     dtype: np.dtype[Any]
-    """The type of its entries."""
+    """The type of the array's entries."""
     row: int | None = None
-    """The row of the dataset; None for the whole dataset."""
+    """The row of the dataset to read; None for the whole dataset."""
 
     @classmethod
     def of(cls, dataset: h5py.Dataset, row: int | None = None) -> Stored:
-        """The stored array of a dataset, or of one row of it."""
+        """Refers to a dataset, or to one row of it."""
         shape = dataset.shape if row is None else dataset.shape[1:]
         return cls(dataset.file, dataset.name, shape, dataset.dtype, row)
 
@@ -54,14 +55,14 @@ class Recorded:
     """An observation with 8-bit colours, in memory or in a file."""
 
     rgb: NDArray[np.uint8] | Stored
-    """(3, rows, cols)."""
+    """(3, rows, cols) red, green and blue from 0 to 255."""
     height: NDArray[np.float32] | Stored
-    """(rows, cols), metres above `grid.z_min`."""
+    """(rows, cols) heights in metres above `grid.z_min`."""
 
     @property
     def image(self) -> NDArray[np.float32]:
-        """(4, rows, cols), as `Observation.image`: colours in [0, 1], height in metres. Computed at
-        each access."""
+        """(4, rows, cols) red, green, blue in [0, 1] and height in metres, like
+        `Observation.image`. It is computed at each access."""
         image = np.empty((4, *self.height.shape), np.float32)
         np.divide(np.asarray(self.rgb), 255, out=image[:3], dtype=np.float32)
         image[3] = np.asarray(self.height)
@@ -77,13 +78,13 @@ class DemonstrationStep(Recorded):
     object: str
     """The name of the picked object."""
     category: str = ""
-    """Its category, if the task has categories."""
+    """The object's category; empty if the task has no categories."""
 
     @staticmethod
     def of(
         observation: Observation, action: PickPlaceAction, *, name: str, category: str = ""
     ) -> DemonstrationStep:
-        """A step of an episode, with colours rounded to 8 bits."""
+        """Makes a step from an observation, with colours rounded to 8 bits."""
         seen = record(observation)
         return DemonstrationStep(seen.rgb, seen.height, action.pick, action.place, name, category)
 
@@ -94,7 +95,7 @@ class FinalObservation(Recorded):
 
     @staticmethod
     def of(observation: Observation) -> FinalObservation:
-        """The observation, with colours rounded to 8 bits."""
+        """Makes a final observation, with colours rounded to 8 bits."""
         seen = record(observation)
         return FinalObservation(seen.rgb, seen.height)
 

@@ -17,13 +17,14 @@ from systems.signals import Observation, PickPlaceAction, PixelGrid, fill_unseen
 
 @dataclass(frozen=True)
 class HeightsOnly:
-    """A recorded observation as the input of networks that see heights alone."""
+    """A recorded observation, prepared as the input of networks that see only heights."""
 
     recorded: Pictured
 
     @property
     def image(self) -> Image:
-        """(4, rows, cols): black, with unseen heights filled in. Computed at each access."""
+        """(4, rows, cols) image with black colours and unseen heights filled in. It is computed at
+        each access."""
         image = self.recorded.image
         image[3] = fill_unseen(image[3], np.any(image, axis=0))
         image[:3] = 0
@@ -31,7 +32,7 @@ class HeightsOnly:
 
 
 def observed(image: Image, grid: PixelGrid) -> Observation:
-    """The observation of a recorded image.
+    """Makes an observation from a recorded image.
 
     Args:
         image: (4, rows, cols). In an all-black image unseen pixels have been filled in.
@@ -65,13 +66,13 @@ class ObservedScene:
 def scenes(
     demonstrations: Iterable[Demonstration], grid: PixelGrid, *, later_picks_possible: bool
 ) -> list[ObservedScene]:
-    """Every observation of some demonstrations with something to pick.
+    """All observations, of some demonstrations, in which something is left to pick.
 
     Args:
         demonstrations: the demonstrations of an expert.
         grid: the pixel grid of their observations.
-        later_picks_possible: whether the expert's later actions are already possible (see
-            `Learning`).
+        later_picks_possible: whether each of the expert's later actions of an episode is already
+            possible (see `Learning`).
     """
     result = []
     for demonstration in demonstrations:
@@ -83,7 +84,7 @@ def scenes(
 
 
 def final_observations(demonstrations: Iterable[Demonstration]) -> list[FinalObservation]:
-    """The observations of some demonstrations with nothing left to pick."""
+    """The observations, of some demonstrations, in which nothing is left to pick."""
     return [item.final for item in demonstrations if item.final is not None]
 
 
@@ -94,8 +95,9 @@ def labelled_images(
 
     Args:
         observed: the observations.
-        taken_only: one sample for each observation, of the expert's own action, as in the paper.
-            Otherwise one for each possible action, with the others as `other_picks`.
+        taken_only: whether to make only one sample for each observation, with the action that the
+            expert took, as in the paper. Otherwise there is one sample for each possible action,
+            with the others as `other_picks`.
     """
     return _Samples(list(observed), taken_only)
 

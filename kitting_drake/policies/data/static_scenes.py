@@ -1,4 +1,5 @@
-"""Static scenes as a file and as training samples (see `static_scenes.drawing`).
+"""Reads and writes files of static scenes, and draws training samples from them (see
+`static_scenes.drawing`).
 
 The file is HDF5, with the attributes `format`, `format_version`, `first_seed` and, as JSON, `grid`
 and `versions`, and these datasets for n scenes with m actions in all:
@@ -40,11 +41,12 @@ FORMAT = "kitting_drake static scenes"
 FORMAT_VERSION = 1
 
 _STEP = 1e-4
-"""The step of the stored heights, in metres."""
+"""The quantization step of the stored heights, in metres."""
 _TEMPERATURE = 0.6
 """A grasp is drawn with a probability proportional to exp(-cost / temperature)."""
 _HEIGHT_SHIFT = 0.002
-"""The standard deviation of a sample's common height shift, in metres."""
+"""The standard deviation of the random shift that is added to all heights of a sample, in
+metres."""
 _DRAWS = 64
 """The number of samples per scene, each with its own random grasps."""
 
@@ -56,24 +58,24 @@ class StaticScene:
     height: NDArray[np.uint16]
     """(rows, cols), in steps of 0.1 mm."""
     actions: NDArray[np.float64]
-    """(m, 8), as in the file."""
+    """(m, 8) the scene's actions, one in each row, with the columns of the file."""
 
     @classmethod
     def of(cls, observation: Observation, actions: NDArray[np.float64]) -> StaticScene:
-        """An observed scene and its possible actions."""
+        """Makes a static scene from an observation and the scene's possible actions."""
         filled = observation.filled_height
         steps = np.clip(np.rint(filled / _STEP), 0, 65535)
         return cls(steps.astype(np.uint16), actions)
 
     @property
     def image(self) -> NDArray[np.float32]:
-        """(4, rows, cols), as `Observation.image`, without colours."""
+        """(4, rows, cols) image like `Observation.image`, with black colours."""
         image = np.zeros((4, *self.height.shape), np.float32)
         image[3] = self.height * np.float32(_STEP)
         return image
 
     def label(self, image: NDArray[np.float32], row: int, grid: PixelGrid) -> LabelledImage:
-        """The labels of one action."""
+        """The labelled image of one action."""
         _, _, x, y, theta, place_x, place_y, place_theta = self.actions[row]
         return LabelledImage(
             image=image,
@@ -86,20 +88,20 @@ class StaticScene:
 
 @dataclass(frozen=True)
 class StaticScenes:
-    """The contents of a file."""
+    """The contents of a file of static scenes."""
 
     grid: PixelGrid
     scenes: tuple[StaticScene, ...]
     first_seed: int = 0
     versions: dict[str, Any] = dataclasses.field(default_factory=dict)
     batch_ends: tuple[int, ...] = ()
-    """As in the file; by default all scenes are one batch."""
+    """The number of scenes up to the end of each batch; by default all scenes are one batch."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "batch_ends", self.batch_ends or (len(self.scenes),))
 
     def part(self, first: int, last: int) -> StaticScenes:
-        """The scenes from `first` up to `last`."""
+        """The scenes from index `first` up to but not including `last`."""
         scenes = self.scenes[first:last]
         inside = (end - first for end in self.batch_ends if first < end < first + len(scenes))
         return dataclasses.replace(self, scenes=scenes, batch_ends=(*inside, len(scenes)))
@@ -176,7 +178,7 @@ def read_static_scenes(path: Path) -> StaticScenes:
 
 
 def _check(heights: NDArray, actions: NDArray, first: NDArray, grid: PixelGrid) -> None:
-    """Raises ValueError for contents that are inconsistent."""
+    """Raises ValueError if the contents are inconsistent."""
     if heights.shape[1:] != grid.shape or heights.dtype != np.uint16:
         raise ValueError(f"its heights have the wrong shape {heights.shape} or type")
     if actions.ndim != 2 or actions.shape[1] != 8 or not np.isfinite(actions).all():
@@ -196,8 +198,8 @@ def _check_batches(ends: NDArray, count: int) -> None:
 class StaticSamples(Sequence[LabelledImage]):
     """Samples drawn from static scenes on demand.
 
-    A sample has one grasp of each loose object, drawn by its cost. Over many samples a network
-    learns the distribution of all feasible grasps.
+    A sample has one grasp of each loose object, which is drawn with a probability that depends on
+    its cost. Over many samples a network learns the distribution of all feasible grasps.
     """
 
     def __init__(self, content: StaticScenes) -> None:

@@ -1,1 +1,2 @@
-"""Decisions by geometry: segmentation of o_t, registration of outlines, jaw clearance."""
+"""Decisions by geometry: segmentation of the heightmap o_t, registration of outlines, and jaw
+clearance."""

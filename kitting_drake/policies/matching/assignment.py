@@ -19,12 +19,14 @@ from kitting_drake.policies.matching.registration import (
 from kitting_drake.policies.matching.segmentation import Region, Segmentation
 
 _WORST_COST = 0.0019
-"""The largest mean difference of an outline and its recess, in metres."""
+"""An object fits into a recess if the mean difference of their outlines is at most this, in
+metres."""
 _GOOD, _CLEARLY_BETTER = 0.0005, 0.75
-"""An object is reversed if its outline fits worse than this, in metres, and the mirror image's
-mismatch is less than this share of its own."""
+"""An object counts as reversed if its mismatch with the recess exceeds the first number, in metres,
+and that of its mirror image is less than the second number times its own."""
 _PROMISING = 2.0
-"""A recess is registered if its coarse cost is at most this multiple of the object's least."""
+"""An object's outline is registered to a recess only if the coarse cost is at most this multiple of
+the object's least coarse cost."""
 
 
 @dataclass(frozen=True)
@@ -38,11 +40,12 @@ class Pair:
     fit: Registration
     """The registration of the object's outline to the recess's."""
     mismatch: float
-    """See `registration.mismatch`, in metres."""
+    """The mismatch of object and recess, see `registration.mismatch`, in metres."""
 
 
 def match(segmentation: Segmentation, resolution: float) -> list[Pair]:
-    """Pairs of loose objects and recesses, best fit first; each occurs at most once.
+    """Pairs of loose objects and recesses, best fit first. Each object and each recess occurs at
+    most once.
 
     Args:
         segmentation: the segmentation of an observation.
@@ -60,7 +63,7 @@ def match(segmentation: Segmentation, resolution: float) -> list[Pair]:
         fits[i, j] = register(outlines[i], recesses[j])
         if is_covered(outlines[i], recesses[j], fits[i, j]):
             costs[i, j] = mismatch(fits[i, j], objects[i], regions[j])
-    # Costs are clipped, so that one hopeless pair does not outweigh all others.
+    # Clip the costs, so that one hopeless pair does not outweigh all others.
     rows, cols = linear_sum_assignment(np.minimum(costs, _WORST_COST))
     pairs = [
         Pair(i, j, fits[i, j], float(costs[i, j]))
@@ -73,15 +76,16 @@ def match(segmentation: Segmentation, resolution: float) -> list[Pair]:
 def reversed_objects(
     segmentation: Segmentation, pairs: Sequence[Pair], resolution: float
 ) -> tuple[int, ...]:
-    """The objects that lie on the wrong face: their outlines fit free recesses as mirror images.
+    """Finds the objects that lie upside down: the mirror images of their outlines fit free
+    recesses.
 
     Args:
         segmentation: the segmentation of an observation.
-        pairs: see `match`. The mirror image of a paired object must fit clearly better.
+        pairs: the result of `match`. For a paired object the mirror image must fit clearly better.
         resolution: the side of its pixels, in metres.
 
     Returns:
-        Indices in `Segmentation.objects`.
+        Indices of these objects in `Segmentation.objects`.
     """
     objects, regions = segmentation.objects, segmentation.recesses
     known = {pair.item: pair for pair in pairs}

@@ -1,4 +1,5 @@
-"""Geometric facts about a pick and place in o_t, from which its confidence is computed."""
+"""Measures geometric facts about a pick and place in o_t, from which `confidence` estimates the
+probability of success."""
 
 from __future__ import annotations
 
@@ -16,9 +17,9 @@ Evidence = dict[str, float]
 """Named facts about a decision; the same names for all decisions of a policy."""
 
 _RING = 3
-"""The surroundings of an object extend this far, in pixels."""
+"""The surroundings of an object extend this far from it, in pixels."""
 _HOLE = 0.003
-"""A hole is lower than its rim by more than this, in metres."""
+"""A part of o_t is a hole if it is lower than its rim by more than this, in metres."""
 _WORST_FIT = 0.002
 _WORST_GRASP = 5.0
 
@@ -31,16 +32,16 @@ def geometric_evidence(
     fit_cost: float | None,
     grasp_cost: float | None,
 ) -> Evidence:
-    """The facts about a pick and place that o_t shows.
+    """Measures facts about a pick and place in o_t.
 
     Args:
         segmentation: the segmentation of o_t.
-        pick: (row, col).
+        pick: (row, col) at which the object is gripped.
         rotation: the rotation of the object, in radians.
-        place: (row, col).
+        place: (row, col) to which the gripped point goes.
         fit_cost: the mean difference of the outlines of object and recess, in metres; None if they
             do not fit.
-        grasp_cost: see `JawGrasp.cost`; None without a feasible grasp.
+        grasp_cost: the cost of the grasp, see `JawGrasp.cost`; None if there is no feasible grasp.
     """
     fits, grasped = fit_cost is not None, grasp_cost is not None
     evidence = {

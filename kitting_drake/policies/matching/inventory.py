@@ -1,4 +1,4 @@
-"""The objects and recesses that o_t shows, together with earlier actions."""
+"""Lists the objects and recesses in o_t, and what earlier actions tell about them."""
 
 from __future__ import annotations
 
@@ -14,30 +14,32 @@ from kitting_drake.policies.matching.splitting import split_touching
 from systems.signals import Attempt, LeftOver, Observation, PlanarPose
 
 _THERE = 0.015
-"""An object within this distance of an earlier pick or place is the one that was moved, in metres.
+"""An object within this distance of an earlier pick or place counts as the one that was moved, in
+metres.
 """
 _MOST_TRIES = 3
 """An object is tried at most this many times."""
 _LEAST_SHARE, _LARGEST_SHARE = 0.5, 1.6
-"""A region may hold objects of recesses if its area is at least this share of the smallest one's,
-and at most this share of the areas of all."""
+"""A region may contain objects for the open recesses if its area is at least the first number times
+that of the smallest recess, and at most the second number times the area of all of them."""
 
 
 @dataclass(frozen=True)
 class Inventory:
-    """The objects and recesses of an observation, and which belong together."""
+    """The objects and recesses of an observation, and the pairs of them that fit."""
 
     observation: Observation
     segmentation: Segmentation
-    """The regions of o_t. Touching objects are separated if the recesses show how."""
+    """The regions of o_t. Touching objects are separated if the outlines of recesses show where one
+    object ends."""
     matches: tuple[Pair, ...]
-    """All objects and recesses that fit, best fit first."""
+    """All pairs of an object and a recess that fit, best fit first."""
     reversed_items: tuple[Region, ...] = ()
     """The objects that must be turned over before they fit."""
 
     @classmethod
     def of(cls, observation: Observation) -> Inventory:
-        """The inventory of an observation."""
+        """Computes the inventory of an observation."""
         segmentation, resolution = segment(observation), observation.grid.resolution
         pairs = match(segmentation, resolution)
         split = split_touching(segmentation, pairs, resolution)
@@ -53,7 +55,7 @@ class Inventory:
 
     @cached_property
     def pairs(self) -> tuple[Pair, ...]:
-        """The matches without objects that were tried too often."""
+        """The matches, except those of objects that were tried too often."""
         return tuple(
             pair
             for pair in self.matches
@@ -69,9 +71,10 @@ class Inventory:
 
     @property
     def strangers(self) -> tuple[Region, ...]:
-        """The objects that fit into no recess and are worth a try, largest first.
+        """The objects that fit into no recess and were not tried too often, largest first.
 
-        One of them may be several objects, or one that lies so that its outline does not show.
+        Such a region may be several touching objects, or one object of which the usual outline is
+        not visible.
         """
         paired = {pair.item for pair in self.pairs}
         objects = enumerate(self.segmentation.objects)
@@ -83,7 +86,7 @@ class Inventory:
 
     @property
     def worth_a_try(self) -> tuple[Region, ...]:
-        """The strangers of a size that may hold objects of the open recesses."""
+        """The `strangers` whose size allows that they contain objects for the open recesses."""
         areas = [int(item.mask.sum()) for item in self.open_recesses]
         if not areas:
             return ()
@@ -92,10 +95,10 @@ class Inventory:
 
     @property
     def left_over(self) -> LeftOver:
-        """The objects that are not seated, and the recesses that are free.
+        """The objects that are not in a recess, and the recesses that are free.
 
-        A flat tool in its recess looks like the floor. So if nothing is loose, a recess into which
-        an object was placed counts as filled.
+        A flat tool in its recess looks like the floor of the recess. So if no object is loose, a
+        recess into which an object was placed counts as filled.
         """
         seen = self.segmentation
         loose = (*seen.objects, *seen.protruding)
@@ -107,7 +110,8 @@ class Inventory:
 
     @property
     def why_stop(self) -> str:
-        """Why a policy stops if it finds nothing to do; a word of `STOP_REASONS`."""
+        """The reason, a key of `STOP_REASONS`, for which a policy stops if it finds nothing to
+        do."""
         seen = self.segmentation
         if not seen.kit_seen and not self._has_filled:
             return "no kit seen"
@@ -119,18 +123,19 @@ class Inventory:
         return "nothing fits" if seen.objects and seen.free_recesses else "done"
 
     def pair_of(self, region: Region) -> Pair | None:
-        """The pair of an object of the segmentation; None if the object fits no recess."""
+        """The pair of an object and its recess; None if the object fits into no recess."""
         objects = self.segmentation.objects
         return next((pair for pair in self.pairs if objects[pair.item] is region), None)
 
     def is_reversed(self, region: Region | None) -> bool:
-        """Whether an object must be turned over before it fits; False for None."""
+        """Whether an object must be turned over before it fits. For None the result is False."""
         return any(item is region for item in self.reversed_items)
 
     def is_tried(self, region: Region | None) -> bool:
-        """Whether an object was tried as often as is worth it; False for None.
+        """Whether an object should not be tried again. For None the result is False.
 
-        An object that fits nowhere is left alone where an earlier action has laid it.
+        That holds after `_MOST_TRIES` attempts, and for an object that fits into no recess and was
+        already laid aside here.
         """
         if region is None:
             return False
@@ -142,11 +147,12 @@ class Inventory:
         return laid or self.tries(region) >= _MOST_TRIES
 
     def tries(self, region: Region) -> int:
-        """How many earlier actions moved this object here, or failed to move it away."""
+        """The number of earlier actions that moved this object here, or failed to move it away."""
         return sum(self._is_there(_left_at(attempt), region) for attempt in self._history)
 
     def was_removed(self, region: Region) -> bool:
-        """Whether an object was taken out from here, and one was placed here again."""
+        """Whether an object was taken out from here earlier, and an object was placed here again
+        since."""
         removed = False
         for attempt in self._history:
             if attempt.outcome != "placed":
@@ -158,7 +164,7 @@ class Inventory:
         return False
 
     def balance(self, region: Region) -> NDArray[np.float64] | None:
-        """(row, col) of an object's centre of mass, if the hand felt it here; else None."""
+        """(row, col) of an object's centre of mass, if the hand has measured it here; else None."""
         for attempt in reversed(self._history):
             if attempt.balance is not None and self._is_there(attempt.action.pick, region):
                 return np.asarray(self.observation.grid.to_pixel(attempt.balance))
@@ -173,7 +179,8 @@ class Inventory:
 
     @property
     def _has_filled(self) -> bool:
-        """Whether an earlier action placed an object in what looks like a plain block now."""
+        """Whether an earlier action placed an object into a fixture that now looks like a plain
+        block."""
         grid, fixture = self.observation.grid, self.segmentation.fixture
         for attempt in self._history:
             place = attempt.action.place
@@ -204,7 +211,7 @@ def _left_at(attempt: Attempt) -> PlanarPose:
 
 
 def mask_of(regions: tuple[Region, ...], shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """(rows, cols): the pixels of all regions."""
+    """(rows, cols) mask of the pixels of all regions."""
     mask = np.zeros(shape, bool)
     for region in regions:
         mask |= region.mask

@@ -1,8 +1,8 @@
-"""Grasps of an object for which o_t leaves the jaws room.
+"""Finds grasps of an object at which the jaws hit nothing that o_t shows.
 
-For each place and angle the heights along the jaws' path are sampled from o_t. Anything above the
-fingertips is either the gripped object or an obstacle. The grasp is centred between the object's
-faces, as closing jaws would centre it.
+For each position and angle the heights along the jaws' path are sampled from o_t. Anything above
+the fingertips is either the gripped object or an obstacle. The grasp is centred between the
+object's faces, as closing jaws would centre it.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ _STEP = 0.0015
 _LINES = 5
 """The number of sampled lines along the pads' length."""
 _ROOM = 0.010
-"""The gripped part is at least this much narrower than the open jaws, in metres, to let the fingers
-come down on either side."""
+"""The gripped part must be narrower than the open jaws by at least this, in metres, so that the
+fingers can come down on either side."""
 _NARROWEST = 0.003
 """The least width of a grasp, in metres."""
 _LOWEST = 0.003
-"""Anything that rises by less than this above its support is no obstacle, in metres."""
+"""Anything that rises by less than this above its support is not an obstacle, in metres."""
 _FINGER_MARGIN = 0.003
 """The clearance kept outside the fingers of the open jaws, in metres."""
 _STRAIGHT = 0.003
@@ -54,7 +54,8 @@ class JawGrasp:
     theta: float
     """The gripper's angle in radians; adding pi gives the same grasp."""
     cost: float
-    """A dimensionless penalty for distance from the centre and for crooked faces; 0 is best."""
+    """A dimensionless penalty for the distance from the object's centre and for faces that are not
+    parallel to the pads; 0 is best."""
 
 
 def failed_pixels(grid: PixelGrid, failed_picks: Sequence[PlanarPose]) -> Array:
@@ -64,11 +65,11 @@ def failed_pixels(grid: PixelGrid, failed_picks: Sequence[PlanarPose]) -> Array:
 
 
 def untried(grasps: Sequence[JawGrasp], failed: Array, resolution: float) -> list[JawGrasp]:
-    """The grasps farther than `RETRY_DISTANCE` from every failed one.
+    """The grasps that are farther than `RETRY_DISTANCE` from every failed grasp.
 
     Args:
-        grasps: candidates.
-        failed: (n, 2), see `failed_pixels`.
+        grasps: the grasps from which to choose.
+        failed: (n, 2) row and column of each failed grasp.
         resolution: the side of a pixel, in metres.
     """
     return [
@@ -96,8 +97,8 @@ def jaw_grasps(
         resolution: the side of a pixel, in metres.
         planner: how deep the fingertips go, and how wide the jaws open.
         support: height of the object's support above the table, in metres.
-        balance: (row, col) of its centre of mass, if known; else that of the volume below its
-            surface counts.
+        balance: (row, col) of the object's centre of mass, if known. Otherwise the centre of the
+            volume below its surface is used.
     """
     relief = segmentation.relief
     pixels = region.pixels
@@ -136,9 +137,9 @@ def _seen(
 
 
 def tip_height(top: Array, support: float, planner: PickPlaceParameters) -> Array:
-    """The height of the fingertips above the table, in metres.
+    """The height of the fingertips above the table at a grasp, in metres.
 
-    It follows `motion_heights`, but stays clear of the support.
+    It is that of `motion_heights`, but keeps a clearance to the object's support.
 
     Args:
         top: the height of the object's top, in metres above the table.
@@ -159,7 +160,7 @@ def _grip(
     planner: PickPlaceParameters,
     support: float,
 ) -> list[JawGrasp]:
-    """The feasible grasps among places (n, 2) and angles (n,)."""
+    """The feasible grasps among positions (n, 2) and angles (n,)."""
     raised = ndimage.maximum_filter(relief, 3)
     top = raised[tuple(np.rint(places).astype(int).T)].astype(float)
     tip = tip_height(top, support, planner)
@@ -222,18 +223,18 @@ def _grip(
 def _straightness(
     inside: NDArray[np.bool_], s: Array, u: Array, left: Array, right: Array
 ) -> tuple[Array, Array, Array]:
-    """How straight the gripped faces are along the pads.
+    """Measures how straight the gripped faces are along the pads.
 
     Args:
-        inside: (n, lines, samples), where each line is within the object.
+        inside: (n, lines, samples) whether each sample is within the object.
         s: (samples,), positions across the jaws, in metres.
         u: (lines,), positions along the pads, in metres.
         left: (n,), the lowest s within the object.
-        right: (n,), the highest s within it.
+        right: (n,), the highest s within the object.
 
     Returns:
-        (n,) each: the share of the lines that touch both pads, and how much the faces
-        lean in all, and in the same direction.
+        Three arrays (n,): the share of the lines that touch both pads, the sum of the slopes of
+        both faces along the pads, and the part of the slopes that both faces share.
     """
     low = np.where(inside.any(axis=2), s[inside.argmax(axis=2)], np.nan)
     high = np.where(inside.any(axis=2), s[len(s) - 1 - inside[:, :, ::-1].argmax(axis=2)], np.nan)
@@ -252,7 +253,7 @@ def _palm_is_free(
     tip: Array,
     resolution: float,
 ) -> NDArray[np.bool_]:
-    """(n,): whether nothing under the palm is as high as the palm.
+    """(n,): whether everything under the palm is lower than the palm.
 
     Args:
         raised: (rows, cols), heights above the table, in metres.
@@ -279,7 +280,7 @@ def _palm_is_free(
 
 
 def _run(occupied: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """(n,): the index of the last of the leading True values of each row."""
+    """(n,): in each row, the index of the last True before the first False."""
     free = ~occupied
     ends = free.argmax(axis=1)
     return np.where(free.any(axis=1), ends - 1, occupied.shape[1] - 1)

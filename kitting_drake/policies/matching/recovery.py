@@ -1,8 +1,8 @@
-"""Recovery from a failed insertion, seen in the next o_t.
+"""Corrects a failed insertion that the next o_t shows.
 
 An object that protrudes from the fixture is not seated. If it protrudes a little, it is pressed
 down once. If it protrudes more, or pressing did not help, it is taken out and laid on the table to
-be tried again. This uses heights alone and is not in the paper.
+be tried again. This uses only heights and is not in the paper.
 """
 
 from __future__ import annotations
@@ -37,14 +37,15 @@ _ROOM = 0.045
 def recovery_action(
     inventory: Inventory, planner: PickPlaceParameters, tried: Sequence[PlanarPose] = ()
 ) -> PickPlaceAction | None:
-    """The recovery of the worst-seated object; None if all are seated or no recovery is feasible.
+    """The action that corrects the object that protrudes most; None if no object protrudes or no
+    correction is feasible.
 
-    An object that was taken out, and placed there again, stays where it is.
+    An object that was already taken out and placed again stays where it is.
 
     Args:
-        inventory: objects and recesses.
-        planner: how the hand will pick.
-        tried: poses of earlier failed grasps and presses.
+        inventory: the objects and recesses of the observation.
+        planner: parameters of the motion with which the hand will pick.
+        tried: gripper poses of earlier failed grasps and presses.
     """
     observation, segmentation = inventory.observation, inventory.segmentation
     pickable = segmentation.visibility.pickable
@@ -64,7 +65,7 @@ def recovery_action(
 def _press(
     observation: Observation, segmentation: Segmentation, region: Region, pickable: Mask
 ) -> PickPlaceAction:
-    """Presses on the highest part of a protruding object that is seen."""
+    """Presses on the highest visible part of a protruding object."""
     mask = region.mask & pickable
     pixels, heights = np.argwhere(mask), segmentation.relief[mask]
     highest = pixels[heights >= np.percentile(heights, 80)].astype(float)
@@ -80,7 +81,7 @@ def _take_out(
     planner: PickPlaceParameters,
     tried: Sequence[PlanarPose],
 ) -> PickPlaceAction | None:
-    """Grips a protruding object and lays it on a free place of the table."""
+    """Grips a protruding object and lays it on a free part of the table."""
     resolution = observation.grid.resolution
     free = _free_place(segmentation, resolution)
     if free is None:
@@ -95,8 +96,8 @@ def _take_out(
 
 
 def _free_place(segmentation: Segmentation, resolution: float) -> Array | None:
-    """The (row, col) farthest from everything; None without enough room."""
-    # Padding keeps objects within the image.
+    """The (row, col) farthest from everything else; None if there is not enough room."""
+    # Mark the image's border as occupied, so that the object is laid inside the image.
     occupied = np.pad(segmentation.occupied, 1, constant_values=True)
     distance = ndimage.distance_transform_edt(~occupied)[1:-1, 1:-1]
     if distance.max() * resolution < _ROOM:

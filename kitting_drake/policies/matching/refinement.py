@@ -1,9 +1,10 @@
-"""Refinement of a network's prediction by the geometry of o_t: its place and its grasp.
+"""Refines the place and the grasp that networks predict, by the geometry of o_t.
 
 The place is refined by fitting the object's outline to the recess, and the grasp by the room for
-the jaws. The fit corrects errors of millimetres and degrees. It also tells an object from its half
-turn, although they may differ only at the ends. If the outlines do not agree, for instance because
-the recess is hidden or there is none, the prediction stays as it is. This is not in the paper.
+the jaws. The fit corrects errors of millimetres and degrees. It also decides between two rotations
+that differ by half a turn, although the outlines may differ only at the ends. If the outlines do
+not agree, for instance because the recess is hidden or there is none, the prediction stays as it
+is. This is not in the paper.
 """
 
 from __future__ import annotations
@@ -37,24 +38,28 @@ Array = NDArray[np.float64]
 _WORST_COST = 0.0016
 """A fit with a larger mean difference of the outlines is rejected, in metres."""
 _HALF_TURN_GAIN = 0.00005
-"""The half turn is taken if its `preference` is larger than this, in metres."""
+"""The rotation by another half turn is chosen if its `preference` is larger than this, in
+metres."""
 _RIVAL_GAIN = 0.85
-"""Another recess is taken if its mismatch is less than this share of the predicted one's."""
+"""Another recess is chosen if its mismatch is less than this share of the predicted recess's
+mismatch."""
 _PROMISING = 1.2
-"""Another recess is registered only if its coarse cost is at most this multiple of the predicted
-one's."""
+"""The object's outline is registered to another recess only if the coarse cost is at most this
+multiple of that of the predicted recess."""
 _LARGEST_SHIFT = 0.010
-"""The largest correction of the object's centre, in metres, ..."""
+"""The largest correction of the object's centre, in metres."""
 _LARGEST_ROTATION = math.radians(10)
-"""... and of its rotation, apart from a half turn."""
+"""The largest correction of the object's rotation, apart from a half turn, in radians."""
 _LEVER = 0.03
-"""A rotation of the jaws by one radian weighs as much as this distance, in metres."""
+"""When grasps are compared, a rotation of the jaws by one radian weighs as much as this distance,
+in metres."""
 _FARTHEST_GRASP = 0.04
 """A refined grasp is at most this far from the predicted one, in metres."""
 _POOR = 0.03
-"""A grasp cost of one weighs as much as this distance, in metres."""
+"""When grasps are compared, a grasp cost of one weighs as much as this distance, in metres."""
 _MUCH_WORSE = 0.5
-"""A predicted grasp is replaced by one that costs less by more than this; see `JawGrasp.cost`."""
+"""A predicted grasp is replaced only if its cost is higher by more than this; see
+`JawGrasp.cost`."""
 _SAME_PLACE, _SAME_ANGLE = 0.008, math.radians(8)
 """Grasps closer than this, in metres and radians, count as the same."""
 _NEAR = 6.0
@@ -63,12 +68,12 @@ _NEAR = 6.0
 
 @dataclass(frozen=True)
 class RefinedPlace:
-    """A rotation and the resulting place of the pick."""
+    """A refined rotation of the object, and the place to which the gripped point goes."""
 
     rotation: float
-    """In radians."""
+    """The object's rotation from pick to place, in radians."""
     place: Array
-    """(row, col)."""
+    """(row, col) to which the gripped point goes."""
     cost: float
     """The mean difference of the outlines, in metres."""
 
@@ -81,16 +86,16 @@ def refine_place(
     resolution: float,
     pairs: Sequence[Pair] = (),
 ) -> RefinedPlace | None:
-    """A refined place; None where the outlines do not determine it.
+    """Refines a predicted place. Returns None if the outlines do not determine it.
 
     Args:
         segmentation: the segmentation of o_t.
-        pick: (row, col).
+        pick: (row, col) at which the object is gripped.
         rotation: predicted rotation of the object, in radians.
         place: (row, col) predicted for the object's point under the pick.
         resolution: the side of a pixel, in metres.
-        pairs: the objects and recesses that fit; see `match`. Such a fit is taken if it is better
-            than the one that begins at the prediction, as for a square that is almost an L.
+        pairs: the result of `match`. The fit of such a pair is used if it is better than the fit
+            that starts at the prediction.
     """
     taken = nearest_region(segmentation.objects, pick)
     if taken is None:
@@ -103,7 +108,8 @@ def refine_place(
     target = trace_outline(recess.mask, resolution)
 
     def fit(angle: float, middle: Array) -> Registration | None:
-        """The fit that starts with the object's centre at `middle`; None if it ends far away."""
+        """The fit that starts with the object's centre at `middle`; None if it ends too far
+        away."""
         start = (angle, middle - rotation_matrix(angle) @ outline.middle)
         found = register(outline, target, starts=(start,))
         away = np.linalg.norm(found.moved(outline.middle) - middle) * resolution
@@ -144,13 +150,14 @@ def _better_elsewhere(
     others: list[Region],
     resolution: float,
 ) -> Registration | None:
-    """The fit to another recess if it is clearly better than the fit to the predicted one.
+    """The fit to another recess, if it is clearly better than the fit to the predicted recess; else
+    None.
 
     Args:
         taken: the object.
-        outline: its outline.
+        outline: the object's outline.
         recess: the predicted recess.
-        target: its outline.
+        target: the outline of the predicted recess.
         fit: the registration of `outline` to `target`.
         others: the other recesses.
         resolution: the side of a pixel, in metres.
@@ -180,14 +187,14 @@ def nearest_region(regions: tuple[Region, ...], pixel: Array) -> Region | None:
 
 @dataclass(frozen=True)
 class RefinedGrasp:
-    """A grasp for which the jaws have room."""
+    """A grasp that leaves the jaws enough room."""
 
     pick: Array
-    """(row, col)."""
+    """(row, col) midway between the pads."""
     theta: float
-    """In radians."""
+    """The gripper's angle, in radians."""
     cost: float
-    """See `JawGrasp.cost`."""
+    """The cost of the grasp, see `JawGrasp.cost`."""
 
 
 def refine_grasp(
@@ -199,27 +206,29 @@ def refine_grasp(
     failed: Array | None = None,
     balance: Array | None = None,
 ) -> RefinedGrasp | None:
-    """A feasible grasp of the same object within 4 cm of a predicted one, or the predicted one
-    itself if it is feasible and not much worse.
+    """Refines a predicted grasp.
 
-    None if there is no feasible grasp.
+    Returns a feasible grasp of the same object within 4 cm of the predicted one. If the predicted
+    grasp is feasible and not much worse, returns it. None if there is no feasible grasp.
 
     Args:
         segmentation: the segmentation of o_t.
         pick: (row, col) predicted.
         theta: predicted angle of the gripper, in radians.
         resolution: the side of a pixel, in metres.
-        planner: how the hand will pick.
-        failed: (n, 2), the (row, col) of failed grasps, which are avoided.
-        balance: (row, col) of the object's centre of mass, if the hand has felt it. The best grasp
-            with respect to it is taken, however far from the predicted one.
+        planner: parameters of the motion with which the hand will pick.
+        failed: (n, 2) row and column of each failed grasp; they are avoided.
+        balance: (row, col) of the object's centre of mass, if the hand has measured it. The grasp
+            with the least cost with respect to it is then chosen, at any distance from the
+            predicted one.
     """
     taken = nearest_region(segmentation.objects, pick)
     if taken is None:
         return None
 
     def away(grasp: JawGrasp) -> tuple[float, float]:
-        """The distance from the predicted grasp, in metres, and the rotation, in radians."""
+        """The distance of a grasp from the predicted one, in metres, and the angle between them, in
+        radians."""
         distance = float(np.linalg.norm(grasp.pixel - pick)) * resolution
         return distance, abs(math.remainder(grasp.theta - theta, math.pi))
 
@@ -238,7 +247,8 @@ def refine_grasp(
     if failed is not None:
         near = untried(near, failed, resolution)
     least = min((grasp.cost for grasp in near), default=math.inf)
-    # The network knows more about a grasp than the jaws' room, so keep it unless it is much worse.
+    # The network considers more than the room for the jaws, so keep its grasp unless that is much
+    # worse.
     same = min((g.cost for g in grasps if is_same(*away(g))), default=None)
     if same is not None and same < least + _MUCH_WORSE:
         return RefinedGrasp(pick, theta, same)

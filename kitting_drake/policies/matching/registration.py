@@ -1,8 +1,9 @@
-"""Sub-pixel registration of an object's outline to a recess's.
+"""Registers an object's outline to that of a recess, to less than a pixel.
 
-Both outlines are signed distances on a grid finer than o_t's. A recess is cut as the object's
-outline, closed and grown by a clearance (see `kitting_drake.hkd.kits.layout`). The object's outline
-is therefore closed first. The remaining offset is fitted: it is the clearance plus half a pixel,
+Both outlines are signed distances on a grid that is finer than that of o_t. A recess has the
+object's outline, with its narrow notches closed and enlarged by a clearance (see
+`kitting_drake.hkd.kits.layout`). The notches of the object's outline are therefore closed first.
+The remaining offset between the outlines is fitted. It is the clearance plus about half a pixel,
 because a view from above makes objects wider and recesses narrower.
 
 At points near the object's outline, the signed distances from the two outlines are compared. The
@@ -27,22 +28,26 @@ Array = NDArray[np.float64]
 _SUBSAMPLING = 3
 """Fine pixels per pixel of o_t."""
 _CLOSING_RADIUS = 0.008
-"""Notches of an object narrower than twice this are missing in its recess, in metres."""
+"""Notches of an object that are narrower than twice this are missing in its recess, in metres."""
 _BAND = 0.006
-"""The cost is taken at points within this distance of the object's outline, in metres."""
+"""The cost is computed at points within this distance of the object's outline, in metres."""
 _FARTHEST = 0.012
 """Distances are clipped to this, in metres."""
 _ROBUST = 0.002
-"""Residuals beyond this stop growing in the cost, in metres: hidden or touching parts are outliers.
+"""Residuals larger than this, in metres, add no more to the cost than one of this size: they come
+from hidden or touching parts.
 """
 _WORST_REVERSE = 0.0025
-"""The largest mean distance of a recess's outline from the object's for a match, in metres."""
+"""The largest mean distance of a recess's outline from the object's at which they match, in
+metres."""
 _LARGEST_OFFSET = 0.004
 """The offset of the outlines is clipped to plus or minus this, in metres."""
 _OFFSET_WITHIN = 0.0025
-"""The same for an outline of several objects, where a larger offset could hide a wrong pose."""
+"""The limit of the offset for an outline of several objects, in metres. A larger offset could hide
+a wrong pose."""
 _HEIGHT_WEIGHT = 0.1
-"""The weight in a mismatch of the difference of object height and recess depth."""
+"""The weight, in a mismatch, of the difference between the object's height and the recess's
+depth."""
 _POINTS, _COARSE_POINTS = 700, 160
 _ROTATIONS = 72
 _STARTS = 3
@@ -54,11 +59,11 @@ class Outline:
     """The outline of a region as signed distances in metres, negative inside."""
 
     distance: NDArray[np.float32]
-    """(m, n) on the fine grid."""
+    """(m, n) signed distances on the fine grid."""
     gradient: tuple[NDArray[np.float32], NDArray[np.float32]]
-    """Along rows and columns, per fine pixel."""
+    """The derivatives of `distance` along rows and columns, per fine pixel."""
     origin: Array
-    """(row, col) of the fine pixel (0, 0), in pixels of o_t."""
+    """(row, col) of the centre of fine pixel (0, 0), in pixels of o_t."""
     middle: Array
     """(row, col) of the region's centroid."""
     points: Array
@@ -67,23 +72,25 @@ class Outline:
     """(p,): the signed distances at `points`."""
 
     def sample(self, field: NDArray[np.float32], positions: Array, outside: float) -> Array:
-        """(n,): `distance` or a `gradient` at positions (n, 2) in pixels of o_t."""
+        """(n,): values of `distance` or of a `gradient` at positions (n, 2) in pixels of o_t."""
         fine = ((positions - self.origin) * _SUBSAMPLING).T
         return ndimage.map_coordinates(field, fine, order=1, mode="constant", cval=outside)
 
 
 @dataclass(frozen=True)
 class Registration:
-    """The fit of an object's outline to a recess's: a point p moves to R(rotation) p + shift."""
+    """The fit of an object's outline to that of a recess. It moves a point p to R(rotation) p +
+    shift."""
 
     rotation: float
-    """Counter-clockwise, in radians."""
+    """The rotation, counter-clockwise, in radians."""
     shift: Array
-    """(row, col), in pixels."""
+    """The shift along rows and columns, in pixels."""
     cost: float
     """The mean robust difference of the outlines, in metres."""
     offset: float = 0.0
-    """By how much the signed distance from the recess's outline exceeds the object's, in metres."""
+    """How much larger the signed distance from the recess's outline is than that from the object's,
+    in metres."""
 
     def moved(self, pixel: Array) -> Array:
         """The new position of a point (row, col) of the object."""
@@ -91,12 +98,12 @@ class Registration:
 
 
 def trace_outline(mask: Mask, resolution: float, *, close: bool = False) -> Outline:
-    """The outline of a region.
+    """Computes the outline of a region.
 
     Args:
-        mask: (rows, cols) with at least one True.
+        mask: (rows, cols) with at least one True pixel.
         resolution: the side of its pixels, in metres.
-        close: bridge narrow notches, which the object's recess does not have.
+        close: whether to close narrow notches, which the object's recess does not have.
     """
     margin = math.ceil((_FARTHEST + _CLOSING_RADIUS) / resolution) + 1
     rows, cols = np.nonzero(mask)
@@ -110,10 +117,10 @@ def trace_outline(mask: Mask, resolution: float, *, close: bool = False) -> Outl
         fine = closed(fine, step)
     outside = ndimage.distance_transform_edt(~fine)
     distance = (outside - ndimage.distance_transform_edt(fine)) * step
-    # The outline runs between a pixel inside and one outside.
+    # The outline lies midway between a pixel inside and one outside.
     distance = np.clip(distance - np.sign(distance) * step / 2, -_FARTHEST, _FARTHEST)
     distance = ndimage.gaussian_filter(distance, 1.0).astype(np.float32)
-    # Fine pixel (0, 0) is a corner of pixel `corner`.
+    # Fine pixel (0, 0) lies at a corner of the coarse pixel `corner`.
     origin = corner - 0.5 + 0.5 / _SUBSAMPLING
     near = np.argwhere(np.abs(distance) < _BAND)
     chosen = near[:: max(1, len(near) // _POINTS)]
@@ -129,9 +136,9 @@ def trace_outline(mask: Mask, resolution: float, *, close: bool = False) -> Outl
 
 
 def closed(mask: Mask, resolution: float) -> Mask:
-    """The mask with narrow notches and all holes filled, as in an object's recess.
+    """Fills narrow notches and all holes of a mask, as in an object's recess.
 
-    The mask must be padded.
+    The mask must have a margin of False pixels.
     """
     grown = ndimage.distance_transform_edt(~mask) * resolution <= _CLOSING_RADIUS
     whole = ndimage.distance_transform_edt(grown) * resolution > _CLOSING_RADIUS
@@ -145,15 +152,15 @@ def register(
     starts: tuple[tuple[float, Array], ...] = (),
     within: bool = False,
 ) -> Registration:
-    """The best fit of an object's outline to a recess's.
+    """Finds the best fit of an object's outline to that of a recess.
 
     Args:
-        outline: the outline of the object, closed.
+        outline: the outline of the object, with closed notches.
         recess: the outline of the recess.
-        starts: initial rotations and shifts. Without any, the best of many rotations about the
-            centroids are refined.
-        within: the second outline is of several touching objects, so that parts of the first have
-            no counterpart: they have little weight, and the offset is almost none.
+        starts: initial rotations in radians and shifts in pixels. If there are none, the best of
+            many rotations about the centroids are refined.
+        within: whether the second outline is that of several touching objects. Parts of the first
+            outline then have no counterpart and get little weight, and the offset is nearly zero.
     """
     begins = starts or _coarse_starts(outline, recess)
     found = [_refine(outline, recess, rotation, shift, within) for rotation, shift in begins]
@@ -168,10 +175,11 @@ def coarse_cost(outline: Outline, recess: Outline) -> float:
 def preference(
     outline: Outline, recess: Outline, first: Registration, second: Registration
 ) -> float:
-    """By how much the first fit is better than the second where the two differ, in metres.
+    """How much better the first fit is than the second where the two differ, in metres.
 
-    For an object and its half turn, most points of the outline agree, and the mean costs differ
-    by noise alone. Here each point is weighted by the difference of the two fits there.
+    If an object is rotated by half a turn, most points of its outline coincide with others, and the
+    mean costs of the two fits differ only by noise. So each point is weighted by the difference of
+    the two fits at that point.
     """
     there, away = zip(*(_compared(outline, recess, fit) for fit in (first, second)), strict=True)
     telling = np.abs(there[0] - there[1])
@@ -183,17 +191,18 @@ def _compared(outline: Outline, recess: Outline, fit: Registration) -> tuple[Arr
     """Compares an object's outline, fitted to a recess, with that recess.
 
     Returns:
-        (p,): the signed distances of the fitted points from the recess's outline, minus the offset
-            between the outlines.
-        (p,): these values, minus the signed distances of the points from the object's own outline.
+        (p,): the signed distances, in metres, of the fitted points from the recess's outline, minus
+            the offset between the outlines.
+        (p,): the first array minus the signed distances of the points from the object's own
+            outline.
     """
     there, offset = _brought(outline, recess, fit)
     return there - offset, there - offset - outline.values
 
 
 def _brought(outline: Outline, recess: Outline, fit: Registration) -> tuple[Array, float]:
-    """(p,): the signed distances of an object's fitted points from the recess's outline; and the
-    offset between the outlines, in metres."""
+    """Moves an object's points by a fit. Returns their signed distances (p,) from the recess's
+    outline, and the offset between the outlines, both in metres."""
     positions = outline.points @ rotation_matrix(fit.rotation).T + fit.shift
     there = recess.sample(recess.distance, positions, _FARTHEST)
     offset = float(np.median(there - outline.values))
@@ -210,11 +219,11 @@ def residuals(outline: Outline, recess: Outline, fit: Registration) -> Array:
 
 
 def is_covered(outline: Outline, recess: Outline, fit: Registration) -> bool:
-    """Whether a fit also brings every part of the recess's outline near the object's.
+    """Whether, after a fit, all of the recess's outline lies near the object's outline.
 
-    `register` measures the distance from the object's outline to the recess's, clipped far away.
-    By that measure a box fits well into a longer cavity, or onto the visible remainder of a filled
-    recess. Measured from the recess's points, such fits are poor.
+    `register` measures distances only from points of the object's outline, and clips them. A box
+    then seems to fit into a longer cavity, or onto the visible remainder of a filled recess.
+    Distances from points of the recess's outline show that such fits are poor.
     """
     back = (recess.points - fit.shift) @ rotation_matrix(fit.rotation)
     _, offset = _brought(outline, recess, fit)
@@ -228,7 +237,7 @@ def mismatch(fit: Registration, item: Region, recess: Region) -> float:
 
 
 def _coarse(outline: Outline, recess: Outline) -> tuple[Array, Array]:
-    """The costs at the coarse rotations about the centroids, and the rotations in radians."""
+    """The costs of evenly spaced rotations about the centroids, and these rotations in radians."""
     step = max(1, len(outline.points) // _COARSE_POINTS)
     offsets = outline.points[::step] - outline.middle
     angles = np.arange(_ROTATIONS) * math.tau / _ROTATIONS
@@ -249,7 +258,8 @@ def _coarse_starts(outline: Outline, recess: Outline) -> list[tuple[float, Array
     lowest = (costs <= np.roll(costs, 1)) & (costs < np.roll(costs, -1))
     candidates = np.flatnonzero(lowest)
     if not len(candidates):
-        # The centroid of an L may be so far outside it that a small object never overlaps it.
+        # The centroid of an L-shaped recess may lie so far outside it that a small object placed
+        # there does not overlap it.
         candidates = np.array([costs.argmin()])
     best = candidates[np.argsort(costs[candidates])][:_STARTS]
     return [
@@ -261,7 +271,8 @@ def _coarse_starts(outline: Outline, recess: Outline) -> list[tuple[float, Array
 def _refine(
     outline: Outline, recess: Outline, rotation: float, shift: Array, within: bool
 ) -> Registration:
-    """Reweighted Gauss-Newton over (rotation about the object's centroid, row, col, offset)."""
+    """Refines a fit by Gauss-Newton with robust weights, over (rotation about the object's
+    centroid, row, col, offset)."""
     arms = outline.points - outline.middle
     place = rotation_matrix(rotation) @ outline.middle + shift
     offset, cost = 0.0, math.inf

@@ -1,8 +1,8 @@
-"""The fingers' room at the place, as o_t shows it.
+"""Measures the fingers' room at the place in o_t.
 
-A symmetric object such as a cube can be placed in several rotations, and the network cannot choose
-among them: its features do not encode how the jaws hold the object. Between neighbouring objects
-the choice matters. This uses heights alone and is not in the paper.
+A symmetric object such as a cube can be placed in several rotations. The networks cannot choose
+among them, because their features do not encode how the jaws hold the object. The choice matters if
+other objects stand beside the place. This uses only heights and is not in the paper.
 """
 
 from __future__ import annotations
@@ -25,11 +25,13 @@ _STEP = 0.001
 _LINES = 7
 """The number of sampled lines along the fingers' length."""
 _SUPPORT_REACH, _SUPPORT_SHARE = 0.06, 10.0
-"""The support's height is this percentile of the heights within this distance, in metres."""
+"""The height of the object's support is estimated from the heights within the first number, in
+metres, as the percentile given by the second."""
 _UNDER = 0.009
-"""The support at the place is the highest point within this distance, in metres."""
+"""The height of the support at the place is that of the highest point within this distance, in
+metres."""
 _LEAST = 0.004
-"""Anything that rises by less than this above the fingertips is no obstacle, in metres."""
+"""Anything that rises by less than this above the fingertips is not an obstacle, in metres."""
 
 
 def blocked_at_place(
@@ -44,12 +46,12 @@ def blocked_at_place(
     """The blocked share of the space that the fingers need at the place.
 
     Args:
-        height: (rows, cols) of o_t, in metres.
+        height: (rows, cols) heights of o_t, in metres.
         resolution: the side of a pixel, in metres.
         pick: (row, col) where the object is gripped.
-        theta: the angle of the gripper there, in radians.
+        theta: the angle of the gripper at the pick, in radians.
         rotation: the rotation of the object from pick to place, in radians.
-        place: (row, col) where the gripper releases it.
+        place: (row, col) where the gripper releases the object.
         planner: the depth of the fingertips, and how far the jaws open at release.
     """
     top = _highest(height, pick, resolution, resolution)

@@ -1,4 +1,4 @@
-"""Segmentation of o_t by height alone: table, fixture, loose objects, recesses.
+"""Segments o_t by height into table, fixture, loose objects and recesses.
 
 It uses neither colour nor a network. The fixture is the largest plateau above the table. Anything
 that rises beside it is a loose object; anything below its top is a recess or a part of one.
@@ -25,13 +25,15 @@ _Fixture = tuple[Mask, Plane]
 """The convex hull of a fixture (rows, cols), and the plane of its top."""
 
 _MOST_FIXTURES, _COMPARABLE = 4, 0.3
-"""The largest number of fixtures; all others have at least this share of the largest one's area."""
+"""The largest number of fixtures, and the least area of a further fixture as a share of the largest
+one's."""
 _PLANE_BAND = 0.004
 """Pixels within this distance of a plane belong to it, in metres."""
 _LEAST_FIXTURE_HEIGHT = 0.015
 """The least height of a fixture above the table, in metres."""
 _LEAST_FIXTURE_AREA = 0.003
-"""The least area of a fixture, in square metres; less with small pixels (`_AreaLimits`)."""
+"""The least area of a fixture, in square metres. It is reduced for small pixels (see
+`_AreaLimits`)."""
 _OBJECT_HEIGHT = 0.003
 """Anything that rises by more than this above the table is an object, in metres."""
 _RECESS_DEPTH = 0.003
@@ -39,45 +41,49 @@ _RECESS_DEPTH = 0.003
 _PROTRUSION = 0.002
 """An object that rises by more than this above the fixture is not seated, in metres."""
 _LEAST_AREA = 0.0004
-"""Smaller regions are ignored as noise, in square metres; less with small pixels."""
+"""Regions with less area than this are ignored as noise, in square metres. It is reduced for small
+pixels."""
 _LEAST_CLEAN_AREA = 0.00008
-"""The same for objects on a table without noise, where only the edges of things are doubtful."""
+"""The least area of an object on a table without noise, in square metres."""
 _LEAST_PROTRUDING = 0.00012
-"""The same for protruding objects. It is smaller, because perhaps only one end protrudes."""
+"""The least area of a protruding object, in square metres. It is small, because an object may
+protrude only at one end."""
 _USUAL_PIXEL = 0.003125
-"""The side of the pixels, in metres, for which the areas above are meant. Noise makes regions of a
-number of pixels, so with smaller ones the areas are smaller by the same factor."""
+"""The side of the pixels, in metres, for which the least areas are chosen. Regions caused by noise
+have a certain number of pixels, so for smaller pixels the least areas are reduced."""
 _CLOSING = 0.0094
-"""Gaps of a plateau up to twice this wide do not divide it, in metres."""
+"""Gaps in a plateau are closed if they are at most twice this wide, in metres."""
 _FIXTURE_MARGIN = 0.006
 """Pixels closer to the fixture's outline than this are neither table nor recess, in metres."""
 _CLEAN = 0.0005
-"""Heights with less noise than this are not filtered, in metres."""
+"""Heights whose noise has a smaller standard deviation than this are not filtered, in metres."""
 _CLEARLY = 2.0
 """A height that differs by more standard deviations than this is not noise.
 
-The few noisy pixels that do are isolated. A larger value would cut off an object's flat ends, by
-which it is told from its half turn.
+The few noisy pixels that exceed it are isolated. A larger value would cut off the flat ends of an
+object, which distinguish it from itself after half a turn.
 """
 _OBJECT_SEEN, _RECESS_SEEN = 0.5, 0.3
-"""The least seen shares of an object, and of a free recess."""
+"""The least shares of an object's pixels, and of a free recess's pixels, that must be seen."""
 _GAP, _LEAST_GAP = 1.5, 0.003
-"""The gap around an object in its recess is less than this far from its edges: in pixels, and in
-metres if that is more."""
+"""Half the width of the gap between an object and its recess is less than this: the first number in
+pixels, or the second in metres if that is more."""
 _FLAT, _FLAT_SHARE = 0.0006, 0.7
-"""More than this share of a free recess's floor is within this of one height, in metres, or within
-noise."""
+"""The floor of a free recess is flat: more than the second number, as a share, is within the first
+number, in metres, of one height. If the noise is larger, its range counts instead."""
 _NOISY = 0.001
-"""With more noise than this a floor cannot be told from an object, in metres."""
+"""If the noise has a larger standard deviation than this, a floor cannot be distinguished from an
+object, in metres."""
 _LEVEL, _TILT_ROUNDS = math.tan(math.radians(0.7)), 3
-"""A plateau with a smaller slope is level. A steeper one is followed in so many rounds."""
+"""A plateau counts as level if its slope is smaller than the first number. A steeper one is
+extended along its slope in as many rounds as the second number."""
 _NEIGHBOURS = np.ones((3, 3), bool)
 _CROSS = ndimage.generate_binary_structure(2, 1)
 
 
 @dataclass(frozen=True)
 class _AreaLimits:
-    """The least areas of what is not noise, in square metres."""
+    """The least areas of regions that are not noise, in square metres."""
 
     fixture: float
     recess: float
@@ -86,7 +92,8 @@ class _AreaLimits:
 
     @classmethod
     def of(cls, resolution: float, noise: float = math.inf) -> _AreaLimits:
-        """The limits for pixels of a side in metres and noise of a standard deviation in metres."""
+        """The limits for a side of the pixels and a standard deviation of the noise, both in
+        metres."""
         scale = min(1.0, (resolution / _USUAL_PIXEL) ** 2)
         least = scale * _LEAST_AREA
         clean = noise <= _CLEAN
@@ -103,7 +110,7 @@ class Region:
     """A connected region of pixels: a loose object or a recess."""
 
     mask: Mask
-    """(rows, cols)."""
+    """(rows, cols) mask of the region."""
     height: float
     """The object's height above the table, or the recess's depth below the fixture's top, in
     metres: the 90th percentile over the region."""
@@ -119,33 +126,36 @@ class Segmentation:
     """The regions of an observation: fixture, recesses, objects."""
 
     fixture: Mask
-    """(rows, cols): the fixture; all False without one."""
+    """(rows, cols) mask of the fixture; all False if there is none."""
     objects: tuple[Region, ...]
-    """Loose on the table."""
+    """The objects that lie loose on the table."""
     recesses: tuple[Region, ...]
     """Regions below the fixture's top, including the visible fragments of filled recesses."""
     protruding: tuple[Region, ...]
-    """The objects that protrude from the fixture, highest first, with their height above its top.
+    """The objects that protrude from the fixture, highest first. Their `height` is that above the
+    fixture's top.
     """
     relief: NDArray[np.float32]
     """(rows, cols): height above the table plane in metres; unseen pixels are filled in."""
     depth: NDArray[np.float32]
-    """(rows, cols): depth below the plane of the fixture's top in metres; zero outside."""
+    """(rows, cols): depth below the plane of the fixture's top in metres; zero outside the
+    fixture."""
     visibility: Visibility
-    """Which of its pixels are seen."""
+    """The pixels of the observation that are seen."""
     noise: float = 0.0
     """The standard deviation of the table's heights, in metres."""
 
     @property
     def kit_seen(self) -> bool:
-        """Whether there is a kit: a fixture with recesses, or with objects in them."""
+        """Whether o_t shows a kit: a fixture with recesses, or with objects in them."""
         return bool(self.fixture.any()) and bool(self.recesses or self.protruding)
 
     @property
     def free_recesses(self) -> tuple[Region, ...]:
         """The recesses that are seen and have a flat floor.
 
-        The gaps around an object in its recess are narrow, and the object itself is not flat.
+        Other recesses contain an object: the gaps around it are narrow, and the object itself is
+        not flat.
         """
         return tuple(
             item
@@ -157,9 +167,10 @@ class Segmentation:
 
     @property
     def occupied(self) -> Mask:
-        """(rows, cols): where no object can be laid down: on something, or where nothing is seen.
+        """(rows, cols) mask of the pixels where no object can be laid down, because something is
+        there or they are not seen.
 
-        Single holes are noise.
+        Single unseen pixels are ignored as noise.
         """
         taken = self.fixture | ~self.visibility.in_view
         taken |= ndimage.binary_opening(~self.visibility.seen, iterations=2)
@@ -170,7 +181,7 @@ class Segmentation:
     def _is_flat(self, recess: Region) -> bool:
         if self.noise > _NOISY:
             return True
-        # Heights at the walls are those of the wall or of the floor. Depths are measured from the
+        # Leave out the pixels at the walls, which show the wall or the floor. Use depths below the
         # fixture's top, so that the floor of a tilted fixture is also flat.
         core = ndimage.binary_erosion(recess.mask) & self.visibility.seen
         floor = self.depth[core if core.any() else recess.mask]
@@ -182,11 +193,11 @@ def segment(observation: Observation) -> Segmentation:
     """Segments an observation.
 
     Args:
-        observation: o_t.
+        observation: the heightmap o_t.
 
     Returns:
-        The segmentation. Without a plateau there are neither a fixture nor recesses. Several kits
-        are one fixture.
+        The segmentation. If there is no plateau, it has neither a fixture nor recesses. Several
+        kits count as one fixture.
     """
     resolution = observation.grid.resolution
     height = observation.filled_height
@@ -214,7 +225,7 @@ def segment(observation: Observation) -> Segmentation:
         loose &= ndimage.distance_transform_edt(~fixture) > margin
         inside = ndimage.distance_transform_edt(fixture) > margin / 2
         depth[~inside] = 0
-        # An unseen region belongs to the recess that it touches.
+        # Add each unseen region to the recess that it touches.
         hidden = inside & ~observation.valid
     deep = depth > max(_RECESS_DEPTH, _CLEARLY * noise)
     return Segmentation(
@@ -222,7 +233,8 @@ def segment(observation: Observation) -> Segmentation:
         objects=tuple(
             item
             for item in _regions(loose, relief, resolution, areas.object)
-            # In the shadow of a block, stray depths are filled in to the shape of an object.
+            # Filling in unseen pixels around a few wrong depths, in the shadow of a block, can
+            # create a region that looks like an object. Ignore such regions.
             if observation.valid[item.mask].mean() > _OBJECT_SEEN
             and not _is_corner(item, fixture, float(relief[fixture].max(initial=0)), resolution)
         ),
@@ -241,7 +253,8 @@ def segment(observation: Observation) -> Segmentation:
 
 
 def _is_corner(item: Region, fixture: Mask, top: float, resolution: float) -> bool:
-    """Whether a small region is a corner of the fixture that its hull cuts off."""
+    """Whether a small region is a corner of the fixture that the fixture's convex hull does not
+    include."""
     if item.mask.sum() * resolution**2 >= _LEAST_AREA or item.height < top - _PLANE_BAND:
         return False
     near = ndimage.binary_dilation(item.mask, iterations=round(2 * _FIXTURE_MARGIN / resolution))
@@ -256,7 +269,8 @@ def _inner_radius(mask: Mask) -> float:
 def _noise_of(
     height: NDArray[np.float32], relief: NDArray[np.float32], fixtures: list[_Fixture]
 ) -> float:
-    """The standard deviation of the noise of the table or of a fixture's top, the largest.
+    """The largest standard deviation of the noise of the table and of the fixtures' tops, in
+    metres.
 
     The table's noise can be underestimated, because heights below the grid are clipped.
     """
@@ -267,7 +281,8 @@ def _noise_of(
 
 
 def _noise(relief: NDArray[np.floating]) -> float:
-    """A robust standard deviation of heights above a plane that contains most of them."""
+    """A robust standard deviation of heights relative to a plane to which most of them belong, in
+    metres."""
     flat = np.abs(relief[np.abs(relief) < 3 * _PLANE_BAND])
     return 1.4826 * float(np.median(flat)) if flat.size else 0.0
 
@@ -291,7 +306,7 @@ def _fit_plane(height: NDArray[np.float32], start: float, where: Mask) -> Plane:
 
 
 def _mode(values: NDArray[np.float32]) -> float:
-    """The most frequent height."""
+    """The most frequent height, in metres."""
     width = 0.001
     low = float(values.min())
     counts = np.bincount(((values - low) / width).astype(int))
@@ -307,7 +322,7 @@ def _fit_table(height: NDArray[np.float32]) -> Plane:
 def _find_fixtures(
     height: NDArray[np.float32], relief: NDArray[np.float32], resolution: float
 ) -> list[_Fixture]:
-    """The largest plateau, and other large ones if they have recesses."""
+    """Finds the largest plateau, and other large ones if they have recesses."""
     high = relief > _LEAST_FIXTURE_HEIGHT
     found: list[_Fixture] = []
     largest = 0
@@ -328,7 +343,8 @@ def _find_fixtures(
 
 
 def _has_recess(fixture: Mask, depth: NDArray[np.float64], resolution: float) -> bool:
-    """Whether a fixture has a recess that it encloses. The hull of a tool is open to its sides."""
+    """Whether a fixture encloses a recess on all sides. A low part within the convex hull of a tool
+    is open to a side."""
     labels, count = ndimage.label(fixture & (depth > _RECESS_DEPTH), _NEIGHBOURS)
     sizes = np.bincount(labels.ravel(), minlength=count + 1)
     rim = fixture & ~ndimage.binary_erosion(fixture, iterations=2)
@@ -340,7 +356,8 @@ def _has_recess(fixture: Mask, depth: NDArray[np.float64], resolution: float) ->
 def _find_fixture(
     height: NDArray[np.float32], relief: NDArray[np.float32], high: Mask, resolution: float
 ) -> _Fixture | None:
-    """The convex hull of the largest plateau among the high pixels, and the plane of its top."""
+    """Finds the largest plateau among the high pixels. Returns its convex hull and the plane of its
+    top, or None."""
     least = _AreaLimits.of(resolution).fixture
     if high.sum() * resolution**2 < least:
         return None
@@ -370,7 +387,8 @@ def _find_fixture(
 
 
 def _along_tilt(plateau: Mask, height: NDArray[np.float32], high: Mask, resolution: float) -> Mask:
-    """The whole of a tilted plateau, of which a level band was found; a level one as it is."""
+    """Extends a plateau that was found as a level band to the whole of a tilted plateau. Returns a
+    level plateau unchanged."""
     for _ in range(_TILT_ROUNDS):
         plane = _fit_plane(height, float(np.median(height[plateau])), plateau)
         if math.hypot(plane[0], plane[1]) < _LEVEL * resolution:
@@ -399,11 +417,11 @@ def _regions(
     """The connected regions of a mask with enough area, largest first.
 
     Args:
-        mask: (rows, cols).
-        relief: the heights, measured within the core.
+        mask: (rows, cols) pixels that belong to regions.
+        relief: (rows, cols) heights in metres. A region's height is measured within the core.
         resolution: the side of a pixel, in metres.
         least: the least area within the core, in square metres.
-        core: the part of the mask that counts; None for all of it.
+        core: the part of the mask in which area and height are measured; None for all of it.
     """
     core = mask if core is None else core
     labels, count = ndimage.label(mask, _NEIGHBOURS)

@@ -1,8 +1,8 @@
 """Prepares objects that cannot be placed yet. This is not in the paper.
 
-- Where objects lie on or against each other and their outlines cannot be told apart, the topmost
+- If objects lie on or against each other and cannot be distinguished by their outlines, the topmost
   one is laid on a free part of the table.
-- An object that lies on the wrong face is turned over an edge of the kit's block.
+- An object that lies upside down is turned over at an edge of the kit's block.
 """
 
 from __future__ import annotations
@@ -27,31 +27,33 @@ from systems.signals import PickPlaceAction, PixelGrid, PlanarPose
 Array = NDArray[np.float64]
 
 _LAYERS = (0.008, 0.014, 0.022, math.inf)
-"""The topmost object is what lies this far below the top, in metres; tried in this order."""
+"""Depths below the highest point down to which a part counts as the topmost object, in metres. They
+are tried in this order."""
 _LEAST_LAYER = 12
-"""A layer of fewer pixels is no object."""
+"""A layer with fewer pixels than this is not an object."""
 _REACH = 0.030
 """An object extends this far beyond its topmost layer, in metres."""
 _ROOMS = (0.030, 0.015, 0.008)
-"""The room around a free place, in metres; tried in this order."""
+"""Clearances around an object at its free place, in metres. They are tried in this order."""
 _TURNS = 12
-"""The number of directions in which an object is laid down."""
+"""The number of rotations that are tried for an object that is laid down."""
 _GRASPS = 6
-"""How many grasps of a layer are tried."""
+"""The number of grasps of a layer that are tried."""
 
 
 def separating_action(
     inventory: Inventory, planner: PickPlaceParameters, failed_picks: Sequence[PlanarPose] = ()
 ) -> PickPlaceAction | None:
-    """Lays the topmost part of the first stranger that can be gripped on a free place.
+    """Lays the topmost part of a heap on a free part of the table.
 
     Args:
-        inventory: objects and recesses.
-        planner: how the hand will pick.
-        failed_picks: poses at which a grasp failed before; it avoids them.
+        inventory: the objects and recesses of the observation.
+        planner: parameters of the motion with which the hand will pick.
+        failed_picks: gripper poses at which a grasp failed before; they are avoided.
 
     Returns:
-        The action; None if there is no stranger, grasp or room.
+        The action for the first of the inventory's `strangers` that can be gripped; None if there
+        is none, or no room on the table.
     """
     observation, segmentation = inventory.observation, inventory.segmentation
     resolution = observation.grid.resolution
@@ -73,15 +75,15 @@ def separating_action(
 def turning_action(
     inventory: Inventory, planner: PickPlaceParameters, failed_picks: Sequence[PlanarPose] = ()
 ) -> PickPlaceAction | None:
-    """Lets go of an object that lies on the wrong face so that it tips over the edge of a block.
+    """Releases an object that lies upside down so that it tips over the edge of a block.
 
     Args:
-        inventory: objects and recesses.
-        planner: how the hand will pick.
-        failed_picks: poses at which a grasp failed before; it avoids them.
+        inventory: the objects and recesses of the observation.
+        planner: parameters of the motion with which the hand will pick.
+        failed_picks: gripper poses at which a grasp failed before; they are avoided.
 
     Returns:
-        The action; None if no object lies on the wrong face, or none has a grasp and a free edge.
+        The action; None if no object lies upside down, or none has a grasp and a free edge.
     """
     segmentation, grid = inventory.segmentation, inventory.observation.grid
     failed = failed_pixels(grid, failed_picks)
@@ -90,7 +92,7 @@ def turning_action(
     for region in inventory.reversed_items:
         if inventory.is_tried(region):
             continue
-        # The centre of its volume stands for its centre of mass.
+        # Use the centre of the object's volume as its centre of mass.
         weights = segmentation.relief[region.mask]
         points = grid.to_world(region.pixels)
         center = np.average(points, axis=0, weights=weights)
@@ -115,7 +117,8 @@ def turning_action(
 
 
 def _ledges(segmentation: Segmentation, grid: PixelGrid) -> list[Ledge]:
-    """The blocks: the smallest rectangle around each fixture."""
+    """The blocks over whose edges objects can be turned: the smallest rectangle around each
+    fixture."""
     labels, count = ndimage.label(segmentation.fixture)
     found = []
     for number in range(1, count + 1):
@@ -138,7 +141,7 @@ def _ledges(segmentation: Segmentation, grid: PixelGrid) -> list[Ledge]:
 
 
 def _layers(segmentation: Segmentation, region: Region) -> list[Region]:
-    """The topmost layers of a region, thinnest first; the last is the whole region."""
+    """The topmost layers of a region, thinnest first. The last one is the whole region."""
     relief = segmentation.relief
     top = float(np.percentile(relief[region.mask], 99))
     layers = []
@@ -156,9 +159,10 @@ def _layers(segmentation: Segmentation, region: Region) -> list[Region]:
 def _free_pose(
     segmentation: Segmentation, region: Region, layer: Region, pick: Array, resolution: float
 ) -> tuple[Array, float] | None:
-    """A place (row, col) of the pick and a rotation with room for the object; None without room.
+    """Finds a free pose for an object. Returns the place (row, col) of the gripped point and the
+    rotation in radians; None if there is no room.
 
-    The nearest place of those with the most room.
+    Of the places with the most room, it is the nearest.
     """
     within = ndimage.distance_transform_edt(~layer.mask) * resolution < _REACH
     footprint = np.argwhere(region.mask & within) - pick
@@ -171,7 +175,7 @@ def _free_pose(
             if free is None:
                 continue
             away = np.linalg.norm(free - pick, axis=1) * resolution
-            # A turn of the wrist also costs time.
+            # A rotation of the wrist costs time as well.
             index = int(away.argmin())
             cost = float(away[index] + 0.05 * abs(angle))
             if best is None or cost < best[0]:
@@ -182,7 +186,8 @@ def _free_pose(
 
 
 def _free_pixels(free: NDArray[np.bool_], footprint: Array) -> Array | None:
-    """(n, 2): the pixels about which all of a footprint (m, 2) is free; None without any."""
+    """(n, 2): the positions at which all pixels of a footprint (m, 2) are free; None if there are
+    none."""
     cells = np.unique(np.rint(footprint).astype(int), axis=0)
     low, high = cells.min(axis=0), cells.max(axis=0)
     kernel = np.zeros(high - low + 1)

@@ -1,4 +1,5 @@
-"""The training-free policy: match outlines to recesses, and grasp where the jaws have room."""
+"""The policy that needs no training: it matches outlines to recesses, and grasps where the jaws
+have room."""
 
 from __future__ import annotations
 
@@ -17,28 +18,29 @@ from systems.signals import Observation, PickPlaceAction, PlanarPose
 
 @dataclass(frozen=True)
 class Matched:
-    """An action, and what o_t tells about it."""
+    """An action, and facts about it that o_t shows."""
 
     action: PickPlaceAction
     geometry: Evidence | None = None
-    """The facts about a pick and place; None for another action."""
+    """The facts about a pick and place; None for any other action."""
 
 
 class ShapeMatchingPolicy:
-    """A training-free function from an observation to an action. It uses no colour.
+    """A policy that needs no training. It uses no colour.
 
     It segments loose objects and recesses by height, registers every outline to every recess, and
     assigns objects to recesses by linear assignment. It picks the best-fitting object for which the
-    jaws have room, and stops when nothing fits. It has no memory but the observation's history.
+    jaws have room, and stops when nothing fits. Its only memory is the observation's history.
     """
 
     def __init__(self, planner: PickPlaceParameters, *, recover: bool = False) -> None:
         """
         Args:
-            planner: how the hand will pick and place.
-            recover: press protruding objects down at once. If nothing fits, take heaps apart
-                (`separating_action`), then take out what could not be pressed down
-                (`recovery_action`), then turn over what lies on the wrong face
+            planner: parameters of the motion with which the hand will pick and place.
+            recover: whether to prepare objects that cannot be placed yet. Protruding objects are
+                pressed down at once. If nothing fits, the policy takes heaps apart
+                (`separating_action`), then takes out objects that could not be pressed down
+                (`recovery_action`), then turns over objects that lie upside down
                 (`turning_action`).
         """
         self._planner = planner
@@ -47,16 +49,16 @@ class ShapeMatchingPolicy:
     def __call__(
         self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()
     ) -> PickPlaceAction:
-        """The action; both gripper poses are in the world.
+        """Returns the action; both gripper poses are in the world.
 
         Args:
-            observation: o_t.
-            failed_picks: poses at which a grasp failed before; it avoids them.
+            observation: the heightmap o_t.
+            failed_picks: gripper poses at which a grasp failed before; they are avoided.
         """
         return self.decide(observation, failed_picks).action
 
     def decide(self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()) -> Matched:
-        """The action with what o_t tells about it; see `__call__`."""
+        """Returns the action and facts about it. For the arguments see `__call__`."""
         inventory = Inventory.of(observation)
         mending = None
         if self._recover:
@@ -68,7 +70,7 @@ class ShapeMatchingPolicy:
             return matched
         if self._recover:
             arguments = inventory, self._planner, failed_picks
-            # The riskiest comes last, because the number of actions is limited.
+            # Try the riskiest action last, because the number of actions is limited.
             prepared = separating_action(*arguments) or mending or turning_action(*arguments)
             if prepared is not None:
                 return Matched(prepared)
@@ -78,7 +80,7 @@ class ShapeMatchingPolicy:
     def _insert(
         self, inventory: Inventory, failed_picks: Sequence[PlanarPose]
     ) -> tuple[Matched | None, str]:
-        """The best insertion, or why there is none."""
+        """The best insertion, or None and the reason for which there is none."""
         observation, segmentation = inventory.observation, inventory.segmentation
         failed = failed_pixels(observation.grid, failed_picks)
         resolution = observation.grid.resolution

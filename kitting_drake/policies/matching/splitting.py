@@ -1,8 +1,8 @@
-"""Tells touching objects apart: finds the outlines of free recesses within a region.
+"""Separates touching objects by finding the outlines of free recesses within their region.
 
-Objects that touch are one region of o_t, and its outline fits no recess. But each recess shows the
-outline of one object. Its best pose within the region, where it covers nothing else and where much
-of its outline is also the region's, cuts that object out of the region.
+Objects that touch are one region of o_t, whose outline fits no recess. But each recess shows the
+outline of one object. This outline is moved to its best pose within the region, at which it lies
+inside the region and shares much of the region's outline. The object is then cut out there.
 """
 
 from __future__ import annotations
@@ -31,24 +31,28 @@ Array = NDArray[np.float64]
 
 _ANGLES = 72
 _STARTS = 5
-"""Rotations tried at first, and poses refined."""
+"""Number of initial poses that are refined for each recess."""
 _OUTSIDE, _NOTCH, _RIM = 3.0, 0.3, 1.5
-"""In the search a pixel of the region counts 1, one in a narrow notch `_NOTCH`, one outside
-`-_OUTSIDE`, and the outline `_RIM` if all of it is also the region's."""
+"""Scores in the search for poses: a covered pixel of the region counts 1, one in a narrow notch
+`_NOTCH`, one outside the region `-_OUTSIDE`, and an outline that coincides with the region's
+`_RIM`."""
 _INSIDE = 0.94
-"""The least share of a recess within the region."""
+"""The least share of a recess's area that must lie within the region."""
 _NEAR = 0.0025
-"""A point of the outline is on the region's if it is this close, in metres."""
+"""A point of an object's outline is shared with the region's outline if it is closer to it than
+this, in metres."""
 _SHARED, _COST = 0.45, 0.0010
-"""The least share of such points, and the largest mean of their distances, in metres."""
+"""The least share of an outline's points that must be shared, and the largest mean distance of
+these points from the region's outline, in metres."""
 _CLEARLY, _UNEXPLAINED = 0.65, 0.15
-"""If more than the second share of a region is no object of a free recess, each outline found in it
-needs a larger share of such points."""
+"""If more than the second number, as a share of a region's area, is not explained by objects of
+free recesses, each outline found in it must share at least the first number of its points."""
 _LEAST_PART = 0.35
-"""A region smaller than this share of a recess's area holds no object of that recess."""
+"""A region whose area is less than this share of a recess's contains no object of that recess."""
 _HIGHER, _ACROSS = 0.006, 6
-"""Something lies on an object if it is higher than its middle by this, in metres, and has this many
-pixels on both sides of its outline."""
+"""Something lies on an object if it is higher than the object's median height by the first number,
+in metres, and has at least as many pixels as the second number on both sides of the object's
+outline."""
 _SLIVER = 1
 """The rest of a region is thinned by this many pixels, to drop slivers."""
 _LEAST_REST = 0.0002
@@ -57,29 +61,29 @@ _LEAST_REST = 0.0002
 
 @dataclass(frozen=True)
 class _Found:
-    """A recess's outline within a region."""
+    """An object found within a region by the outline of a recess."""
 
     recess: int
     mask: Mask
-    """(rows, cols): the object."""
+    """(rows, cols) mask of the object."""
     shared: float
-    """The share of its outline that is also the region's."""
+    """The share of the object's outline that coincides with the region's."""
     cost: float
-    """The mean distance of that share, in metres."""
+    """The mean distance of the shared points from the region's outline, in metres."""
 
 
 def split_touching(
     segmentation: Segmentation, pairs: Sequence[Pair], resolution: float
 ) -> Segmentation:
-    """The segmentation with regions of touching objects split, where the free recesses tell how.
+    """Splits regions of touching objects, if outlines of free recesses show where one object ends.
 
     Args:
         segmentation: the segmentation of o_t.
-        pairs: the objects that fit into a recess as they are; see `match`.
+        pairs: the regions that fit into a recess without a split; see `match`.
         resolution: the side of a pixel, in metres.
 
     Returns:
-        The same object if nothing is split.
+        The new segmentation; the given one if nothing is split.
     """
     objects = segmentation.objects
     matched = {pair.item for pair in pairs}
@@ -107,7 +111,8 @@ def _split(
     relief: NDArray[np.float32],
     resolution: float,
 ) -> list[Region]:
-    """The objects of a region, or the region itself. Adds the recesses found to `taken`."""
+    """Returns the objects of a region, or the region itself. Adds the recesses of the objects to
+    `taken`."""
     parts: list[_Found] = []
     rest = region.mask
     while rest.any():
@@ -126,7 +131,7 @@ def _split(
         rest = rest & ~best.mask
     unexplained = rest.sum() > _UNEXPLAINED * region.mask.sum()
     if unexplained and any(item.shared < _CLEARLY for item in parts):
-        # A large box contains the outlines of many recesses.
+        # Reject the split: a large box contains the outlines of many recesses.
         taken -= {item.recess for item in parts}
         parts = []
     if not parts:
@@ -154,7 +159,7 @@ def _find(
     around: Outline,
     resolution: float,
 ) -> _Found | None:
-    """The best pose of a recess's outline within a region; None if it has no place there."""
+    """Finds the best pose of a recess's outline within a region; None if it fits nowhere."""
     template = trace_outline(recess.mask, resolution)
     best: _Found | None = None
     for start in _starts(recess.mask, region, template, resolution):
@@ -180,7 +185,7 @@ def _judge(
     back = (positions - fit.shift) @ rotation_matrix(fit.rotation)
     distance = template.sample(template.distance, back, math.inf).reshape(region.shape)
     covered = distance < -fit.offset
-    # Close the notches of the region, because those of recesses are closed.
+    # Close the notches of the region, because recesses have none.
     filled = closed(region, resolution)
     if not covered.any() or filled[covered].mean() < _INSIDE:
         return None
@@ -209,7 +214,8 @@ def _is_under_another(mask: Mask, region: Mask, relief: NDArray[np.float32]) -> 
 def _starts(
     recess: Mask, region: Mask, template: Outline, resolution: float
 ) -> list[tuple[float, Array]]:
-    """Rotations and shifts at which most of a recess lies within a region, by correlation."""
+    """Finds rotations in radians and shifts in pixels at which most of a recess lies within a
+    region, by correlation."""
     shape = _crop(recess)
     rows, cols = np.nonzero(region)
     half = math.ceil(math.hypot(*shape.shape) / 2) + 1
@@ -219,9 +225,9 @@ def _starts(
     own[rows - low[0], cols - low[1]] = True
     field = np.where(own, 1.0, np.where(closed(own, resolution), _NOTCH, -_OUTSIDE))
     edge = ndimage.gaussian_filter(_edge(own).astype(np.float32), 1.0)
-    # Wrapped sums are wrong only where they are cut off below.
+    # The Fourier transform is cyclic. The values that wrap around are cut off below.
     size = tuple(fft.next_fast_len(n, real=True) for n in field.shape)
-    # One transform for both: the field counts the inside, the edge the outline.
+    # Score the inside with `field` and the outline with `edge`; one inverse transform serves both.
     inside = fft.rfft2((field / shape.sum()).astype(np.float32), size)
     outline = fft.rfft2(edge, size)
     middle = (np.array(shape.shape) - 1) / 2
@@ -250,7 +256,7 @@ def _starts(
 
 
 def _distinct(found: list[tuple[float, float, Array]]) -> list[tuple[float, float, Array]]:
-    """The best starts that are not neighbours in rotation."""
+    """The best initial poses whose rotations are not neighbours."""
     kept: list[tuple[float, float, Array]] = []
     for item in found:
         if all(abs(math.remainder(item[1] - other[1], math.tau)) > 0.2 for other in kept):

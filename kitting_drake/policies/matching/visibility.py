@@ -1,8 +1,8 @@
-"""The parts of o_t that are seen well enough to pick and place there.
+"""Finds the parts of o_t that are seen well enough to pick and place there.
 
-A robot must not reach where no camera looks. It may reach into a small shadow, because one camera
-sees no object from all sides. So the pick itself and most of what the jaws sweep must be seen, and
-no part of this may be outside all views.
+A robot must not reach where no camera looks. It may reach into a small shadow, because a camera
+never sees an object from all sides. So the pick itself and most of the area that the jaws sweep
+must be seen, and all of this area must be within some camera's view.
 """
 
 from __future__ import annotations
@@ -21,23 +21,24 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _MARGIN = 0.010
-"""A pick is at least this far inside of the cameras' views, in metres."""
+"""A pick must be at least this far inside the cameras' views, in metres."""
 _AROUND = 5
-"""More than half of the pixels in a square of this side are seen around a pick."""
+"""Side of the square around a pick of which more than half must be seen, in pixels."""
 _LANDING, _SWEPT = 0.5, 0.5
-"""The least seen shares of what each finger lands on, and of what the jaws sweep while closing."""
+"""The least shares that must be seen of the area on which each finger comes down, and of the area
+that the jaws sweep while closing."""
 _LINES, _DEPTHS, _SWEEPS = 5, 4, 17
 """Numbers of samples along the pads, across a finger, and from finger to finger."""
 _INSIDE = 0.9
-"""The least share of an object within the workspace at its place."""
+"""The least share of an object that must lie within the workspace at its place."""
 _OUT_OF_VIEW = 0.02
-"""The largest share of an object outside all views at its place."""
+"""The largest share of an object that may lie outside all cameras' views at its place."""
 _RING = 3
 """The surroundings of a place extend this far from the object, in pixels."""
 _RING_SEEN, _PLACE_SEEN = 0.5, 0.25
-"""The least seen shares of these surroundings and of the place itself."""
+"""The least shares that must be seen of the surroundings of a place and of the place itself."""
 _BLIND = 0.020
-"""The radius of an object of unknown outline, in metres."""
+"""The radius that is assumed for an object of unknown outline, in metres."""
 
 
 @dataclass(frozen=True)
@@ -45,9 +46,10 @@ class Visibility:
     """The pixels of an observation that are seen, or could be seen."""
 
     seen: Mask
-    """(rows, cols)."""
+    """(rows, cols) mask of the pixels that some camera sees."""
     in_view: Mask
-    """(rows, cols): pixels towards which some camera looks, even if something hides them."""
+    """(rows, cols) mask of the pixels in some camera's field of view, whether or not something
+    hides them."""
     resolution: float
     """The side of a pixel, in metres."""
 
@@ -70,11 +72,12 @@ class Visibility:
         return pickable
 
     def picks_are_seen(self, pixels: Array, thetas: Array, open_width: float) -> Mask:
-        """(n,): whether enough is seen of each pick's pixel and of what the jaws sweep there.
+        """(n,): whether enough is seen of each pick's surroundings and of the area that the jaws
+        sweep.
 
         Args:
-            pixels: (n, 2), row and column.
-            thetas: (n,), of the gripper, in radians.
+            pixels: (n, 2) row and column of each pick.
+            thetas: (n,) angle of the gripper at each pick, in radians.
             open_width: the opening of the jaws before they close, in metres.
         """
         if self.seen.all() and self.in_view.all():
@@ -96,13 +99,13 @@ class Visibility:
     def place_is_seen(
         self, footprint: Array | None, pick: Array, rotation: float, place: Array
     ) -> bool:
-        """Whether enough is seen of where an object will lie, and around it.
+        """Whether enough is seen of the area in which an object will lie, and of its surroundings.
 
         Args:
             footprint: (n, 2), the pixels of the object where it lies; None if they are unknown.
-            pick: (row, col) at which it is gripped.
+            pick: (row, col) at which the object is gripped.
             rotation: the rotation of the object from pick to place, in radians.
-            place: (row, col) to which that point goes.
+            place: (row, col) to which the gripped point goes.
         """
         if footprint is None:
             reach = np.arange(-_BLIND, _BLIND + self.resolution, self.resolution) / self.resolution
@@ -127,7 +130,7 @@ class Visibility:
 
 
 def _at(mask: Mask, positions: Array) -> Mask:
-    """The values of a mask at positions (..., 2); True beyond the workspace."""
+    """The values of a mask at positions (..., 2) in pixels; True outside the mask."""
     row, col = np.moveaxis(np.rint(positions).astype(int), -1, 0)
     rows, cols = mask.shape
     outside = (row < 0) | (row >= rows) | (col < 0) | (col >= cols)

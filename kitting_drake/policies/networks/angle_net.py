@@ -19,7 +19,8 @@ class AngleNetSize:
     """The depth and width of a pick-angle network."""
 
     stages: tuple[tuple[int, ...], ...]
-    """The number of fields of each layer, by stage; features are pooled between stages."""
+    """For each stage, the number of fields of each of its layers. Features are pooled between
+    stages."""
     kernel: int = 7
     """The side of each layer's kernels, in pixels."""
     readout: int = 7
@@ -37,7 +38,7 @@ class AngleNetSize:
 
 
 class AngleNet(MixedPrecision):
-    """Maps a crop to one vector of the output fibre, equivariantly (equation 3).
+    """Maps a crop equivariantly to one vector of the output fibre (equation 3 of the paper).
 
     If the crop is rotated by r, the vector is transformed by the fibre's representation rho(r).
     """
@@ -72,7 +73,7 @@ class AngleNet(MixedPrecision):
         self.readout = convolution(*before, 1, out_fibre, size.readout, padding=padding)
 
     def forward(self, crop: Tensor) -> Tensor:
-        """(batch, in channels, side, side) to (batch, out channels), in float32."""
+        """Maps (batch, in channels, side, side) to (batch, out channels), in float32."""
         features = crop.contiguous(memory_format=torch.channels_last)
         for index, layers in enumerate(self.stages):
             assert isinstance(layers, nn.ModuleList)

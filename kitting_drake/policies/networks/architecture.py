@@ -1,4 +1,4 @@
-"""The architecture of a policy's networks: the config that a weights file needs."""
+"""The config of a policy's networks, which a weights file stores."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Preset:
     )
     """The pick-angle network beta."""
     angle_band: int = 6
-    """j_c of beta's hidden fields."""
+    """The cutoff frequency j_c of beta's hidden fields."""
     angle_samples: int = 32
     """The number of samples of each of beta's SO(2) fields, on which the nonlinearity acts."""
     group_angle: AngleNetSize = field(
@@ -58,7 +58,7 @@ _SMALL = Preset(
 )
 
 PRESETS = {
-    # Section V-A of the paper.
+    # The sizes in section V-A of the paper.
     "paper": Preset(),
     # For machines without an accelerator: each U-net has 0.2 M parameters.
     "small": _SMALL,
@@ -72,7 +72,7 @@ PRESETS = {
         ),
         resnet=(13, 13, 26, 52, 102),
     ),
-    # For tests: every part of the architecture at its smallest.
+    # For tests: every part of the architecture has its smallest size.
     "tiny": Preset(
         unet=UNetSize(down=(2, 4, 4, 4, 4), up=(4, 4, 2, 2), head=4, skip=1),
         samples=8,
@@ -103,9 +103,9 @@ class NetworkConfig:
     """The architecture of a method's networks, and how their inputs are normalised."""
 
     method: str = "so2"
-    """One of METHODS."""
+    """The method, one of METHODS."""
     preset: str = "small"
-    """One of PRESETS."""
+    """The name of the networks' size, one of PRESETS."""
     orientations: int = 180
     """N, the number of orientations, at which the networks are trained."""
     colour_mean: float = 0.5
@@ -117,11 +117,11 @@ class NetworkConfig:
     height_std: float = 0.01
     """The standard deviation of the heights in training, in metres."""
     band: int = BAND
-    """j_c of the U-nets' fields."""
+    """The cutoff frequency j_c of the U-nets' fields."""
     angle_frequencies: tuple[int, ...] = ANGLE_FREQUENCIES
     """The frequencies of beta's output."""
     colour: bool = True
-    """Whether the networks see colours. Otherwise they see heights alone, with unseen pixels filled
+    """Whether the networks see colours. Otherwise they see only heights, with unseen pixels filled
     in (see `systems.signals.fill_unseen`)."""
     stop: bool = False
     """Whether the picking module has a class "nothing to pick" (see `losses.log_odds`)."""
@@ -143,7 +143,7 @@ class NetworkConfig:
 
     @property
     def channels(self) -> int:
-        """The number of input channels: red, green, blue and height, or height alone."""
+        """The number of input channels: red, green, blue and height, or only height."""
         return 4 if self.colour else 1
 
     def has_unets_of(self, preset: str) -> bool:

@@ -1,4 +1,4 @@
-"""The device and the floating-point type of the networks."""
+"""Chooses the device and the floating-point type of the networks."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import torch
 import torch.nn.functional as F
 
 _CLEARLY = 0.8
-"""bfloat16 must take less than this share of float32's time, to make the choice reproducible."""
+"""bfloat16 is chosen if it takes less than this share of float32's time. The margin makes the
+choice reproducible."""
 _ROUNDS = 5
 _SHAPES = ((1, 32, 81, 161), (32, 32, 3, 3))
 """The input and the kernel of a typical U-net convolution, which takes a few milliseconds."""
@@ -43,7 +44,7 @@ def _is_faster_in_bfloat16() -> bool:
     """Compares the fastest of several alternating convolutions in each type."""
     fastest = dict.fromkeys((torch.float32, torch.bfloat16), float("inf"))
     threads = torch.get_num_threads()
-    # On shared cores, threads that wait for one another would add processor time.
+    # Use one thread: on shared cores, threads that wait for each other would add processor time.
     torch.set_num_threads(1)
     try:
         for _ in range(1 + _ROUNDS):  # The first round is a warm-up.

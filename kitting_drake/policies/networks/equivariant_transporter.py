@@ -1,8 +1,8 @@
 """The Equivariant Transporter, the first baseline of the paper (section V-C.3).
 
-It differs from the SO(2) method in its fields: regular fields of C_6 in the U-nets, whose output is
-invariant, and regular fields of C_N / C_2 in the angle network. N is therefore part of the
-architecture: the angle network's parameters, kernels and time grow with N.
+It differs from the SO(2) method in its fields. The U-nets, whose output is invariant, have regular
+fields of C_6, and the angle network has regular fields of C_N / C_2. N, the number of orientations,
+is therefore part of the architecture: the angle network's parameters, kernels and time grow with N.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _ORDER = 6
 
 
 class EquivariantTransporterNetworks(FactoredNetworks):
-    """Networks of regular fields.
+    """The networks of the Equivariant Transporter, with regular fields.
 
     With the preset "paper" the angle network has the authors' 0.90, 1.81, 3.01 and 4.51 million
     parameters at N = 36, 72, 120 and 180.
@@ -40,7 +40,7 @@ class EquivariantTransporterNetworks(FactoredNetworks):
         self.psi = UNet(config.channels, sizes.FEATURES, fibre, preset.unet, convolution)
 
     def check_orientations(self, orientations: int) -> None:
-        """Raises ValueError if the networks were trained at another N."""
+        """Raises ValueError if the networks were trained with another number of orientations N."""
         if orientations != self.config.orientations:
             raise ValueError(
                 f"this Equivariant Transporter was trained at {self.config.orientations} "

@@ -30,7 +30,7 @@ def as_escnn(networks: SO2Networks, autocast: torch.dtype | None = None) -> Netw
     """The same networks built from escnn's modules.
 
     Args:
-        networks: made with `SteerableConv2d`; their weights are copied.
+        networks: networks made with `SteerableConv2d`; their weights are copied.
         autocast: the type for torch's automatic mixed precision; None for float32.
     """
     reference = make_networks(networks.config)
@@ -59,7 +59,7 @@ class EscnnUNet(nn.Module):
         self.out = _convolution(source.out)
 
     def forward(self, image: Tensor) -> Tensor:
-        """(batch, in channels, rows, cols) to (batch, out channels, rows, cols) in float32."""
+        """Maps (batch, in channels, rows, cols) to (batch, out channels, rows, cols) in float32."""
         with _autocast(image, self.autocast):
             features = self.elu(self.lift(enn.GeometricTensor(image, self.lift.in_type)))
             levels = []
@@ -83,7 +83,7 @@ class _EscnnBlock(nn.Module):
     def __init__(self, source: nn.Module, *, invariant: bool = False) -> None:
         """
         Args:
-            source: the block.
+            source: the block to copy.
             invariant: whether the output is only the invariant part.
         """
         super().__init__()
@@ -100,7 +100,7 @@ class _EscnnBlock(nn.Module):
         self.out_type = self.elu.out_type
 
     def forward(self, features: enn.GeometricTensor) -> enn.GeometricTensor:
-        """(batch, coefficients, rows, cols) to the same rows and cols."""
+        """Maps (batch, coefficients, rows, cols) to the same rows and cols."""
         hidden = self.second(self.first_elu(self.first(features)))
         return self.elu(hidden + self.shortcut(features))
 
@@ -125,7 +125,7 @@ class EscnnAngleNet(nn.Module):
         self.in_type = modules[0].in_type
 
     def forward(self, crop: Tensor) -> Tensor:
-        """(batch, in channels, side, side) to (batch, out channels), in float32."""
+        """Maps (batch, in channels, side, side) to (batch, out channels), in float32."""
         with _autocast(crop, self.autocast):
             features = self.layers(enn.GeometricTensor(crop, self.in_type))
             return features.tensor.float().mean(dim=(2, 3))
@@ -147,7 +147,8 @@ def _field_type(fibre: Fibre, count: int) -> enn.FieldType:
 
 
 def _convolution(source: nn.Module) -> enn.R2Conv:
-    """The same convolution with the same weights, which are stored in escnn's order."""
+    """Makes escnn's version of a convolution with the same weights, which are stored in escnn's
+    order."""
     assert isinstance(source, SteerableConv2d)
     out_fields, in_fields, _ = source.weights.shape
     layer = enn.R2Conv(

@@ -1,4 +1,5 @@
-"""The networks alpha, beta, phi and psi: their predictions and their losses (section III-C)."""
+"""The networks alpha, beta, phi and psi, their predictions and their losses (section III-C of the
+paper)."""
 
 from __future__ import annotations
 
@@ -45,13 +46,13 @@ predicted pick."""
 
 
 class AnglePrediction(NamedTuple):
-    """f_theta at one pixel."""
+    """The predicted pick angles at one pixel, f_theta of the paper."""
 
     logits: Tensor
-    """(N / 2,), at the gripper angles 2 pi i / N."""
+    """(N / 2,) logits at the gripper angles 2 pi i / N."""
     refined: float | None
-    """The most likely angle in radians, not quantized; None if the method predicts discrete angles
-    only."""
+    """The most likely angle in radians, not quantized; None if the method predicts only discrete
+    angles."""
 
 
 @dataclass(frozen=True)
@@ -59,9 +60,9 @@ class PickPrediction:
     """The picking module's prediction for one observation."""
 
     position: Tensor
-    """(rows, cols): the logits of f_p."""
+    """(rows, cols): the logits of the pick position, f_p of the paper."""
     angle: Callable[[tuple[int, int]], AnglePrediction]
-    """f_theta at a pixel (row, col)."""
+    """A function that predicts the pick angles at a pixel (row, col)."""
     log_odds: float | None
     """The log-odds that there is something to pick (see `losses.log_odds`); None if the networks do
     not predict it."""
@@ -74,14 +75,15 @@ class PlacePrediction:
     candidates: list[Candidate]
     """Windows of f_place around its peaks, best first."""
     score_map: Tensor
-    """(rows, cols): the best score over all rotations, possibly interpolated."""
+    """(rows, cols): the best score of each pixel over all rotations, possibly interpolated."""
 
 
 class Networks(nn.Module):
-    """The base class of every method's networks: their inputs and the placing module.
+    """The base class of every method's networks, with the preparation of inputs and the placing
+    module.
 
     Subclasses define `phi` and `psi` (scalar encodings of the scene and of a crop) and the picking
-    module. Calls keep no state.
+    module. Calls do not change the networks' state.
     """
 
     phi: nn.Module
@@ -94,7 +96,7 @@ class Networks(nn.Module):
         self.config = config
         self.preset = PRESETS[config.preset]
         self.compute_type = torch.float32
-        """The type of the networks' inputs, in which they compute."""
+        """The floating-point type of the networks' inputs, in which they compute."""
         self.rotations: int | None = None
         """The number of crop rotations in a training step of the Transporter. Scene rotations are
         half as many. None is the default of `transporter.draw_bins`. Other methods ignore it."""
@@ -108,7 +110,8 @@ class Networks(nn.Module):
         return next(self.parameters()).device
 
     def freeze(self, compute_type: torch.dtype) -> None:
-        """Prepares for inference: evaluation mode, no gradients, weights cast once.
+        """Prepares the networks for inference: evaluation mode, no gradients, and weights cast
+        once.
 
         Args:
             compute_type: the type to compute in.
@@ -120,7 +123,7 @@ class Networks(nn.Module):
                 module.cast(compute_type)
 
     def prepare(self, image: Image) -> Tensor:
-        """An observation, or a crop of one, as a network input.
+        """Converts an observation, or a crop of one, to a network input.
 
         Args:
             image: (4, rows, cols), as `Observation.image`.
@@ -131,7 +134,7 @@ class Networks(nn.Module):
         return self.prepare_batch(torch.from_numpy(np.array(image, order="C"))[None])
 
     def prepare_batch(self, images: Tensor) -> Tensor:
-        """A batch of network inputs.
+        """Converts images to a batch of network inputs.
 
         Args:
             images: (n, 4, rows, cols), each as `Observation.image`.
@@ -163,24 +166,25 @@ class Networks(nn.Module):
         discretization_matrix(orientations, self.config.angle_frequencies, quotient=2)
 
     def predict_pick(self, image: Image, orientations: int) -> PickPrediction:
-        """f_p and f_theta (section III-C.1) at N orientations."""
+        """Predicts the pick position f_p and the pick angle f_theta (section III-C.1) at N
+        orientations."""
         raise NotImplementedError
 
     def predict_place(
         self, image: Image, pixel: tuple[int, int], orientations: int
     ) -> PlacePrediction:
-        """f_place (section III-C.2) for the crop around a pick.
+        """Predicts placements f_place (section III-C.2) for the crop around a pick.
 
         Args:
             image: the observation.
             pixel: (row, col) of the pick.
-            orientations: N.
+            orientations: N, the number of orientations.
         """
         rows, cols = image.shape[1:]
         scene, encoding = self.encode_scene(image), self.encode_crop(image, pixel)
         candidates, volume = search(scene, encoding, orientations, shape=(rows, cols))
         best = volume.amax(0)
-        # Cell (i, j) of the coarse volume is at pixel (2 i, 2 j).
+        # Cell (i, j) of the coarse volume corresponds to pixel (2 i, 2 j).
         size = (2 * best.shape[0] - 1, 2 * best.shape[1] - 1)
         full = F.interpolate(best[None, None], size=size, mode="bilinear", align_corners=True)
         return PlacePrediction(candidates, full[0, 0, :rows, :cols])
@@ -215,7 +219,7 @@ class Networks(nn.Module):
 
         Args:
             image: the observation.
-            random: the random generator of all draws.
+            random: the generator of all random draws.
         """
         raise NotImplementedError
 
@@ -250,18 +254,19 @@ class FactoredNetworks(Networks):
     picking = "pick_position"
 
     def position_logits(self, image: Image) -> Tensor:
-        """f_p: (rows, cols)."""
+        """(rows, cols): the logits of the pick position, f_p of the paper."""
         rows, cols = image.shape[1:]
         return self.alpha(self.prepare(image))[0, 0, :rows, :cols]
 
     def crop_angle_logits(self, crops: Tensor, orientations: int) -> Tensor:
-        """f_theta: prepared crops (n, channels, side, side) to logits (n, N / 2)."""
+        """Maps prepared crops (n, channels, side, side) to logits of the pick angle (n, N / 2),
+        f_theta of the paper."""
         raise NotImplementedError
 
     def predict_angle(
         self, image: Image, pixel: tuple[int, int], orientations: int
     ) -> AnglePrediction:
-        """f_theta at a pixel."""
+        """Predicts the pick angles at a pixel (row, col)."""
         prepared = self.prepare(crop(image, pixel, sizes.PICK_CROP))
         return AnglePrediction(self.crop_angle_logits(prepared, orientations)[0], None)
 
@@ -292,7 +297,8 @@ class FactoredNetworks(Networks):
         yield "pick_angle", lambda: self._angle_loss(sample, pixels)
 
     def _angle_loss(self, sample: LabelledImage, pixels: list[tuple[int, int]]) -> Tensor:
-        """The mean over all picks and, where there are curvatures, their bent copies."""
+        """The mean loss over the crops of all picks and, if there are curvatures, over their bent
+        copies."""
         orientations = self.config.orientations
         crops = [crop(sample.image, pixel, sizes.PICK_CROP) for pixel in pixels]
         thetas = [sample.pick_theta, *sample.other_thetas]
@@ -322,7 +328,8 @@ class FactoredNetworks(Networks):
 
 
 class SO2Networks(FactoredNetworks):
-    """The paper's own method: irrep fields of SO(2), and a discretized irrep vector for angles."""
+    """The networks of the paper's own method: hidden fields of SO(2) irreps, and an irrep vector
+    that is discretized to angles."""
 
     def __init__(self, config: NetworkConfig, convolution: Convolution = SteerableConv2d) -> None:
         super().__init__(config)
@@ -366,7 +373,7 @@ def within_image(sample: LabelledImage) -> LabelledImage:
 
 
 def jittered(pixel: NDArray[np.float64], random: np.random.Generator) -> tuple[int, int]:
-    """A random pixel near a position."""
+    """Draws a random pixel near a position (row, col)."""
     offset = random.integers(-_JITTER, _JITTER + 1, size=2)
     row, col = np.rint(pixel).astype(int) + offset
     return int(row), int(col)

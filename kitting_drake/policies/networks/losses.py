@@ -31,17 +31,17 @@ even odds for an image of the paper's size."""
 _WINDOW = 17
 """The side of the window of the plain correlation around a label, in pixels."""
 _FINE_REACH = math.radians(10)
-"""How far the window extends from the label's rotation, in radians."""
+"""How far the window of the plain correlation extends from the label's rotation, in radians."""
 
 
 def interpolate_label(
     position: float, count: int, *, cyclic: bool = False
 ) -> list[tuple[int, float]]:
-    """A fractional position as (index, weight) pairs, by linear interpolation.
+    """Converts a fractional position to (index, weight) pairs by linear interpolation.
 
     Args:
-        position: in bins.
-        count: the number of bins; weight beyond them goes to the outermost.
+        position: the position, in bins.
+        count: the number of bins. Weight of positions beyond them goes to the outermost bin.
         cyclic: whether the bins wrap around.
     """
     first = math.floor(position)
@@ -92,10 +92,10 @@ def presence_loss(odds: Tensor, *, present: bool) -> Tensor:
 
 
 def position_loss(logits: Tensor, *pixels: tuple[float, float]) -> Tensor:
-    """Cross-entropy over the pixels of f_p.
+    """Cross-entropy over the pixels of the pick position f_p.
 
     Args:
-        logits: (rows, cols).
+        logits: (rows, cols) logits of the pixels.
         pixels: the labels (row, col), which may be fractional; all are equally likely.
     """
     rows, cols = logits.shape
@@ -107,12 +107,12 @@ def position_loss(logits: Tensor, *pixels: tuple[float, float]) -> Tensor:
 
 
 def angle_loss(logits: Tensor, theta: float, orientations: int) -> Tensor:
-    """Cross-entropy over the orientations of f_theta, modulo pi.
+    """Cross-entropy over the orientations of the pick angle f_theta, modulo pi.
 
     Args:
-        logits: (N / 2,), at the angles 2 pi i / N.
-        theta: the label, in radians.
-        orientations: N.
+        logits: (N / 2,) logits of the angles 2 pi i / N.
+        theta: the angle of the label, in radians.
+        orientations: N, the number of orientations.
     """
     bins = theta / (math.tau / orientations)
     label = soft_label(interpolate_label(bins, orientations // 2, cyclic=True), like=logits)
@@ -137,9 +137,9 @@ def place_loss(
         scene: (1, channels, rows, cols), phi(o_t).
         encoding: (1, channels, side, side), psi(c).
         pixel: the label (row, col).
-        rotation: the label, in radians.
-        orientations: N.
-        generator: draws the offsets of the window and of the coarse rotations from the label.
+        rotation: the rotation of the label, in radians.
+        orientations: N, the number of orientations.
+        generator: draws how far the window and the coarse rotations are offset from the label.
     """
     draws = torch.rand(3, generator=generator).tolist()
     coarse_angles = rotation_angles(COARSE_ROTATIONS, scene, draws[0])
@@ -179,11 +179,11 @@ def place_loss(
 
 
 def _covered(coarse: Tensor, differences: Tensor, corner: tuple[int, int]) -> Tensor:
-    """The mask of the coarse cells inside the window around a label.
+    """Mask of the coarse cells that lie inside the window around a label.
 
     Args:
-        coarse: (n, rows, cols), at half the resolution.
-        differences: (n,), the cells' rotations minus the label's, in radians.
+        coarse: (n, rows, cols) scores at half the resolution.
+        differences: (n,) rotations of the cells minus that of the label, in radians.
         corner: the window's first pixel (row, col).
     """
     row = torch.arange(coarse.shape[1], device=coarse.device) * 2 - corner[0]
@@ -199,12 +199,12 @@ def _covered(coarse: Tensor, differences: Tensor, corner: tuple[int, int]) -> Te
 def joint_loss(
     logits: Tensor, *labels: tuple[list[tuple[int, float]], tuple[float, float]]
 ) -> Tensor:
-    """Cross-entropy over orientations and pixels jointly, as in the Transporter.
+    """Joint cross-entropy over orientations and pixels, as in the Transporter.
 
     Args:
         logits: (orientations, rows, cols).
-        labels: pairs of an orientation as (index, weight) pairs (see `interpolate_label`) and a
-            pixel (row, col); all are equally likely.
+        labels: the labels, all equally likely. Each is a pair of an interpolated orientation (see
+            `interpolate_label`) and a pixel (row, col).
     """
     _, rows, cols = logits.shape
     parts = [

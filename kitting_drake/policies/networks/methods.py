@@ -1,4 +1,4 @@
-"""The methods, by their names in configs and command lines."""
+"""Makes the networks of each method by its name in configs and command lines."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _METHODS: dict[str, Callable[[NetworkConfig, Convolution], Networks]] = {
 
 
 def make_networks(config: NetworkConfig, convolution: Convolution = SteerableConv2d) -> Networks:
-    """The networks of a config with untrained weights.
+    """Makes the networks of a config, with untrained weights.
 
     Args:
         config: the architecture.

@@ -33,7 +33,7 @@ class PlainLayer(nn.Module):
 
 
 class Bottleneck(nn.Module):
-    """Convolutions of 1, 3 and 1 pixels in a row, with a shortcut."""
+    """A residual block of three convolutions with kernels of 1, 3 and 1 pixels."""
 
     def __init__(
         self,
@@ -78,7 +78,8 @@ class Bottleneck(nn.Module):
 
 
 class ResNet(MixedPrecision):
-    """The Transporter's hourglass: down to an eighth of the resolution and up again.
+    """The Transporter's hourglass network, which reduces the resolution to an eighth and restores
+    it.
 
     It has 43 layers: a stem, and two blocks of three convolutions in each of four stages down and
     three up. Shortcut convolutions are not counted.
@@ -116,7 +117,7 @@ class ResNet(MixedPrecision):
 
 
 def _stage(channels_in: int, channels: int, *, stride: int = 1) -> nn.Sequential:
-    """Two blocks; the first has the stride."""
+    """A stage of two blocks, of which the first has the stride."""
     return nn.Sequential(
         Bottleneck(channels_in, channels, channels, stride=stride),
         nn.ReLU(inplace=True),

@@ -45,14 +45,14 @@ from kitting_drake.policies.networks.losses import (
 from kitting_drake.policies.networks.resnet import ResNet
 
 _NEAR = math.radians(10)
-"""Rotations within this of a label are easily confused with it and form their own stratum (see
-`draw_bins`)."""
+"""Rotations within this angle of a label, in radians, are easily confused with it and form their
+own stratum (see `draw_bins`)."""
 _DRAWS = 2
 """The default number of rotations that a training step draws in each stratum.
 
-More make a step slower, and did not help in a test: 750 steps of the place networks on
-align-box-corner at a learning rate of 3e-4 gave a validation cross-entropy over all rotations of
-6.6 with 2 and 7.9 with 16.
+More draws make a step slower and did not help in a test. After 750 steps of the place networks on
+the task align-box-corner, with a learning rate of 3e-4, the validation cross-entropy over all
+rotations was 6.6 with 2 draws and 7.9 with 16.
 """
 _COARSE = 36
 """The largest number of crop rotations that are encoded first at inference."""
@@ -61,7 +61,7 @@ _CANDIDATES = 3
 
 
 class TransporterNetworks(Networks):
-    """f_pick, phi and psi, as three residual networks of 43 layers."""
+    """The networks f_pick, phi and psi of the Transporter, each a residual network of 43 layers."""
 
     picking = "pick"
 
@@ -69,7 +69,7 @@ class TransporterNetworks(Networks):
         """
         Args:
             config: the architecture.
-            convolution: unused; there are no steerable convolutions.
+            convolution: not used, because the Transporter has no steerable convolutions.
         """
         super().__init__(config)
         widths = self.preset.resnet
@@ -97,11 +97,11 @@ class TransporterNetworks(Networks):
         return rotated(scores, theta, (rows, cols))[0, 0]
 
     def _on_device(self, image: Image) -> Tensor:
-        """(1, 4, rows, cols)."""
+        """Moves an image to the networks' device, as (1, 4, rows, cols)."""
         return torch.from_numpy(np.array(image, order="C")).to(self.device)[None]
 
     def predict_pick(self, image: Image, orientations: int) -> PickPrediction:
-        """Reads position and angle from one volume: its maximum, and the best angle per pixel."""
+        """Predicts position and angle from one volume of scores over pixels and angles."""
         volume = self.pick_volume(image, orientations)
         return PickPrediction(
             position=volume.amax(0),
@@ -171,10 +171,11 @@ class TransporterNetworks(Networks):
     def predict_place(
         self, image: Image, pixel: tuple[int, int], orientations: int
     ) -> PlacePrediction:
-        """f_place over all pixels, at all rotations for N up to 36.
+        """Predicts f_place over all pixels and, for N up to 36, at all rotations.
 
-        For larger N, 36 nearly evenly spaced bins come first. Then all bins between the neighbours
-        of the three best peaks are encoded and correlated at pixels near each peak.
+        For larger N, 36 nearly evenly spaced rotations are evaluated first. Then, for each of the
+        three best peaks, all bins between the neighbouring rotations are encoded and correlated at
+        pixels near the peak.
         """
         shape = (image.shape[1], image.shape[2])
         step = math.tau / orientations
@@ -237,15 +238,16 @@ def draw_bins(
     random: np.random.Generator,
     rotations: int | None = None,
 ) -> dict[int, float]:
-    """The rotations of a training step: sampled softmax with two strata, near the labels and far.
+    """Draws the rotations of a training step for a sampled softmax with two strata, near the labels
+    and far from them.
 
     Args:
-        labels: bins to include.
+        labels: bins that must be included.
         bins: the total number of bins, over half a rotation or a full one.
         step: the angle between neighbours, in radians.
-        random: draws the other bins.
+        random: the generator that draws the other bins.
         rotations: the number of bins to return, including the labels. Half of the drawn bins are
-            near a label, if there are enough. None draws two per stratum, the minimum.
+            near a label, if there are enough. None draws the minimum of two bins per stratum.
 
     Returns:
         A dict from bins to log weights in nats. Adding these to the logits makes the drawn bins
@@ -272,7 +274,7 @@ def draw_bins(
 
 
 def among(label: list[tuple[int, float]], drawn: dict[int, float]) -> list[tuple[int, float]]:
-    """An interpolated label over positions in `drawn` instead of bins."""
+    """Converts an interpolated label from bins to positions in `drawn`."""
     index = {bin_: position for position, bin_ in enumerate(drawn)}
     return [(index[bin_], weight) for bin_, weight in label]
 
@@ -281,18 +283,19 @@ def canvas_shape(shape: tuple[int, int], angle: float) -> tuple[int, int]:
     """Rows and cols that hold all pixel centres of a rotated image of the given shape."""
     cos, sin = abs(math.cos(angle)), abs(math.sin(angle))
     height, width = shape[0] - 1, shape[1] - 1
-    # Rounding errors must not add a pixel to a rotation by 90 degrees.
+    # Subtract a little, so that rounding errors do not add a pixel at a rotation by 90 degrees.
     rows = math.ceil(height * cos + width * sin - 1e-6)
     cols = math.ceil(height * sin + width * cos - 1e-6)
     return rows + 1, cols + 1
 
 
 def rotated(image: Tensor, angle: float, shape: tuple[int, int]) -> Tensor:
-    """An image rotated about its centre with bilinear sampling; zero (unseen) outside it.
+    """Rotates an image about its centre with bilinear sampling; pixels outside the image are zero
+    (unseen).
 
     Args:
         image: (1, channels, rows, cols).
-        angle: counter-clockwise, in radians.
+        angle: the rotation, counter-clockwise, in radians.
         shape: rows and cols of the result, which has the same centre.
 
     Returns:
@@ -321,7 +324,7 @@ def rotated_crops(image: Tensor, pixel: tuple[int, int], angles: Sequence[float]
 def _sampled(
     image: Tensor, centre: tuple[float, float], angles: Sequence[float], shape: tuple[int, int]
 ) -> Tensor:
-    """An image rotated about a point by each angle, with that point at the centre."""
+    """Rotates an image about a point by each angle. That point is the centre of the results."""
     axes = [
         torch.arange(side, dtype=image.dtype, device=image.device) - (side - 1) / 2
         for side in shape

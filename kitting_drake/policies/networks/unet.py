@@ -38,7 +38,7 @@ class UNetSize:
 
 
 class ResidualBlock(nn.Module):
-    """Two convolutions with a shortcut, and ELU after each."""
+    """A residual block of two convolutions, with ELU after each."""
 
     def __init__(
         self,
@@ -60,7 +60,7 @@ class ResidualBlock(nn.Module):
         )
 
     def forward(self, features: Tensor) -> Tensor:
-        """(batch, channels, rows, cols) to the same rows and cols."""
+        """Maps (batch, channels, rows, cols) to the same rows and cols."""
         hidden = self.second(F.elu_(self.first(features)))
         return F.elu_(hidden + self.shortcut(features))
 
@@ -68,8 +68,8 @@ class ResidualBlock(nn.Module):
 class UNet(MixedPrecision):
     """Maps scalar images to scalar images through hidden fields of one fibre, in 21 layers.
 
-    Its input and output are trivial fields, so it commutes with rotations of the image (equation
-    3).
+    Its input and output are trivial fields, so a rotation of the input rotates the output (equation
+    3 of the paper).
     """
 
     def __init__(

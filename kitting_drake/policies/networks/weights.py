@@ -1,8 +1,9 @@
-"""Trained networks as safetensors files. Loading gives plain convolutions, without a group library.
+"""Reads and writes trained networks as safetensors files. Loaded networks have plain convolutions
+and need no group library.
 
-A file holds the trained weights, which are coefficients of kernel bases, and the few bases. The
-plain kernels are expanded from these when the file is loaded. Storing the kernels themselves would
-take ten times the space (37 MB instead of 4 for the preset "small").
+A file holds the trained weights, which are coefficients in bases of kernels, and the few bases. The
+plain kernels are expanded from both when the file is loaded. Storing the kernels themselves would
+take ten times the space (37 MB instead of 4 MB for the preset "small").
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ FORMAT = "kitting_drake policy"
 FORMAT_VERSION = 1
 
 _RENAMED = {"colour_deviation": "colour_std", "height_deviation": "height_std"}
-"""Renamed config fields of older files."""
+"""Config fields that have other names in older files, with their present names."""
 _ADDED = ("colour", "stop")
 """Config fields that older files lack; they take their defaults."""
 
@@ -78,7 +79,7 @@ def save_weights(path: Path, networks: Networks, card: dict[str, Any]) -> None:
 
     Args:
         path: the file; it is written atomically.
-        networks: with steerable convolutions.
+        networks: networks with steerable convolutions.
         card: see `WeightsFile`; must be serializable as JSON.
     """
     tensors: dict[str, Tensor] = {}
@@ -154,7 +155,7 @@ def load_networks(path: Path, compute_type: torch.dtype = torch.float32) -> Netw
     try:
         networks.load_state_dict(state)
     except RuntimeError as error:
-        # Torch lists every mismatched tensor; the first is enough.
+        # Torch lists every mismatched tensor. Report only the first.
         first = textwrap.shorten(str(error).splitlines()[1], 150, placeholder=" ...")
         raise UserError(
             f"{path}: the weights do not fit a {config.preset} {config.method} network: {first}"
@@ -175,13 +176,14 @@ def load_trainable(
 
     Args:
         path: a file that `save_weights` wrote.
-        fresh_angle_at: N of the result. Its pick-angle network then has untrained weights, because
-            its architecture may depend on N. None keeps the file's N and all its weights.
+        fresh_angle_at: number of orientations N of the result. Its pick-angle network then has
+            untrained weights, because its architecture may depend on N. None keeps the file's N and
+            all its weights.
         preset: the preset of the result. Its U-nets must have the same size
             (`NetworkConfig.has_unets_of`). None keeps the file's.
 
     Raises:
-        UserError: as `load_networks`.
+        UserError: the file is unusable, see `load_networks`.
         ValueError: the networks do not support that N.
     """
     plain = load_networks(path)

@@ -10,7 +10,7 @@ from kitting_drake.policies.networks.architecture import NetworkConfig
 
 
 def normalisation(observed: list[ObservedScene]) -> dict[str, float]:
-    """The normalisation fields of a `NetworkConfig`."""
+    """Computes the normalisation fields of a `NetworkConfig` from observations."""
     # A generator keeps only one image in memory.
     images = (scene.recorded.image for scene in observed)
     moments = np.array([[_moments(image[:3]), _moments(image[3])] for image in images])
@@ -30,10 +30,10 @@ def _moments(values: NDArray[np.float32]) -> tuple[float, float]:
 
 
 def _mean_and_std(moments: NDArray[np.float64]) -> tuple[float, float]:
-    """The mean and standard deviation from the `_moments` of equally many values each.
+    """Computes mean and standard deviation from the `_moments` of n arrays of equal size.
 
     Args:
-        moments: (2, n).
+        moments: (2, n) the means, and the means of the squares.
     """
     mean, square = moments.mean(axis=1)
     variance = float(square) - float(mean) ** 2

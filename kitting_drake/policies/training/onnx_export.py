@@ -37,17 +37,17 @@ class _BlurOfAnySize(nn.Module):
         self.register_buffer("kernel", pool.kernel[None, None].clone())
 
     def forward(self, features: Tensor) -> Tensor:
-        """(batch, channels, rows, cols), odd sides, to half the resolution."""
+        """Maps (batch, channels, rows, cols) with odd sides to half the resolution."""
         alone = features.reshape(-1, 1, features.shape[2], features.shape[3])
         halved = F.conv2d(alone, self.kernel, stride=2, padding=2)
         return halved.reshape(features.shape[0], -1, halved.shape[2], halved.shape[3])
 
 
 def require_onnx() -> ModuleType:
-    """The package onnx.
+    """Imports the package onnx.
 
     Raises:
-        UserError: it is not installed.
+        UserError: the package is not installed.
     """
     return import_extra("onnx", purpose="--export onnx", extra="onnx")
 
@@ -55,9 +55,9 @@ def require_onnx() -> ModuleType:
 def export_onnx(weights: Path, folder: Path) -> list[Path]:
     """Writes the networks of a weights file as ONNX in float32, and `policy.json`.
 
-    Each graph maps `image`, prepared as in `policy.json`, to `output`. The U-nets alpha, phi and
-    psi take any sides that are one more than a multiple of 16 pixels; beta takes its crop. Crops,
-    rotations and correlation are not exported (see docs/learning.md).
+    Each graph maps `image`, prepared as `policy.json` describes, to `output`. The U-nets alpha, phi
+    and psi take any sides that are one more than a multiple of 16 pixels; beta takes its crop.
+    Crops, rotations and correlation are not exported (see docs/learning.md).
 
     Args:
         weights: a file that `train` wrote.
@@ -119,8 +119,8 @@ def _graph(network: nn.Module, example: Tensor, *, any_size: bool) -> bytes:
         warnings.catch_warnings(),
         torch.no_grad(),
     ):
-        # The exporter warns about traced shape checks and about its age. The newer exporter takes a
-        # minute per network instead of a second.
+        # The exporter warns about traced shape checks and that it is deprecated. The newer exporter
+        # takes a minute per network instead of a second.
         warnings.simplefilter("ignore")
         file = Path(scratch) / "network.onnx"
         torch.onnx.export(

@@ -37,13 +37,13 @@ from kitting_drake.policies.training.training_step import Trainer
 from kitting_drake.policies.training.validation import mean_loss, validate
 
 WEIGHTS = "policy.safetensors"
-"""The best weights, in the folder of a training run."""
+"""The file of the best weights, in the folder of a training run."""
 _CHECKPOINT_EVERY = 100
-"""Steps between checkpoints, and between points of the curves."""
+"""Number of steps between checkpoints, and between points of the logged curves."""
 _MOST_VALIDATED = 64
-"""The most scenes, and the most final observations, that a validation uses."""
+"""A validation uses at most this many scenes, and at most this many final observations."""
 _MOST_NORMALISED = 512
-"""The most scenes that the normalisation is computed from."""
+"""The normalisation is computed from at most this many scenes."""
 _DAMAGED = (
     OSError,
     EOFError,
@@ -69,12 +69,13 @@ class Settings:
     preset: str
     orientations: int
     rotations: int | None
-    """See `Networks.rotations`."""
+    """The number of crop rotations in a training step, see `Networks.rotations`."""
     steps: int
     learning_rate: float
     decay: bool
     taken_only: bool
-    """Whether observations are labelled with the expert's own action only, not with later picks."""
+    """Whether observations are labelled only with the action that the expert took, and not with
+    later picks."""
     rigid: bool
     """Whether curvature augmentation is off."""
     reflection: bool
@@ -98,7 +99,7 @@ class Settings:
 
 
 def _begun(settings: Settings, learned: TrainingData, start: Path | None) -> Networks:
-    """The networks before the first step: untrained ones, or those of a file."""
+    """Makes the networks before the first step, with untrained weights or with those of a file."""
     torch.manual_seed(settings.seed)
     try:
         if start is not None:
@@ -136,7 +137,7 @@ class TrainingRun:
         Args:
             settings: the settings of the run.
             learned: the training data.
-            held_out: the validation data, by which a checkpoint is chosen.
+            held_out: the validation data, which decide which checkpoint is kept.
             folder: the folder of the run's files.
             console: where to show progress.
             start: weights to start from; None for untrained ones.
@@ -173,7 +174,7 @@ class TrainingRun:
         self.best: dict[str, Any] | None = None
         self.seconds = 0.0
         self.recent: list[dict[str, float]] = []
-        """The losses since the last point of the curves."""
+        """The losses of each step since the last point of the logged curves."""
         self.card = {
             **dataclasses.asdict(settings),
             "samples": len(self.samples),
@@ -211,7 +212,7 @@ class TrainingRun:
                 step = trainer.step_count
                 last = step == settings.steps
                 speed = (step - begun) / (time.perf_counter() - clock)
-                progress.update(task, completed=step, speed=f"{speed:.2f} a second")
+                progress.update(task, completed=step, speed=f"{speed:.2f} steps/s")
                 if step % settings.validate_every == 0 or last:
                     report = self._validate(writer)
                     progress.print(_report_line(step, report), highlight=False)
@@ -231,7 +232,7 @@ class TrainingRun:
         self.console.print(
             f"{self.settings.method}, {self.settings.preset}: {size:,} parameters; "
             f"{len(self.samples)} samples{finals} of {self.settings.demonstrations} "
-            f"demonstrations; {len(self.validation_scenes)} scenes to validate by",
+            f"demonstrations; {len(self.validation_scenes)} scenes for validation",
             highlight=False,
         )
 
@@ -242,7 +243,7 @@ class TrainingRun:
             raise UserError(f"{DIVERGED} at step {self.trainer.step_count}: lower --learning-rate")
 
     def _log_losses(self, writer: SummaryWriter) -> None:
-        """Logs the mean of each loss over the steps since the last point of the curves."""
+        """Logs the mean of each loss since the last point of the curves."""
         step = self.trainer.step_count
         names = {name: None for losses in self.recent for name in losses}
         means = {

@@ -23,20 +23,20 @@ _STOP_PROBABILITY = 1 / 8
 
 @dataclass(frozen=True)
 class _Draw:
-    """The random sample of a step, with a final observation in some steps."""
+    """The random sample of a training step, in some steps with a final observation."""
 
     sample: LabelledImage
     random: np.random.Generator
-    """For the random draws of the losses."""
+    """The generator for the random draws of the losses."""
     final: Image | None
     """A final observation; None in most steps."""
     stop_random: np.random.Generator
-    """For the random draws of the stop loss."""
+    """The generator for the random draws of the stop loss."""
 
 
 @dataclass(frozen=True)
 class _Prepared:
-    """The draw for the next step, prepared in the background."""
+    """The sample for the next step, prepared in the background."""
 
     step: int
     samples: Sequence[LabelledImage]
@@ -44,13 +44,13 @@ class _Prepared:
     draw: Future[_Draw]
 
     def of(self, samples: Sequence[LabelledImage], finals: Sequence[Pictured]) -> bool:
-        """Whether the draw is from these sequences (by identity)."""
+        """Whether the sample was drawn from exactly these sequence objects."""
         return self.samples is samples and self.finals is finals
 
 
 def decayed(step: int, steps: int) -> float:
-    """The factor of the learning rate at a step: linear warm-up over a hundred steps, and cosine
-    decay to zero over all steps."""
+    """The factor of the learning rate at a step: a linear warm-up over a hundred steps times a
+    cosine decay to zero over all steps."""
     rise = min(1.0, (step + 1) / 100)
     return rise * 0.5 * (1 + math.cos(math.pi * min(1.0, step / steps)))
 
@@ -81,11 +81,12 @@ class Trainer:
             seed: the seed of all random draws.
             steps: the total number of steps.
             learning_rate: the learning rate of Adam.
-            decay: let the learning rate decay to zero (`decayed`) instead of keeping it constant.
-            curvature: see `augment`.
-            reflection: see `augment`.
-            only: the one loss to train; None trains all. The modules of other losses keep their
-                weights. The given loss takes the same steps as if all were trained.
+            decay: whether the learning rate decays to zero (see `decayed`) instead of staying
+                constant.
+            curvature: whether to augment by curvature, see `augment`.
+            reflection: whether to augment by reflection, see `augment`.
+            only: the name of the only loss to train; None trains all. The modules of other losses
+                keep their weights. The random draws are the same as if all losses were trained.
         """
         self.networks = networks
         self.seed = seed
@@ -126,14 +127,15 @@ class Trainer:
     def step(
         self, samples: Sequence[LabelledImage], finals: Sequence[Pictured] = ()
     ) -> dict[str, float]:
-        """One step on a random, augmented sample.
+        """Executes one training step on a random, augmented sample.
 
-        In one step of eight, networks that can stop also learn from a final observation. Its loss
-        is added to that of the picking module. The other modules are not affected.
+        In one of eight steps, on average, networks that can stop also learn from a final
+        observation. Its loss is added to that of the picking module. The other modules are not
+        affected.
 
         Args:
-            samples: observations with something to pick.
-            finals: observations with nothing left to pick.
+            samples: labelled observations in which something is left to pick.
+            finals: observations in which nothing is left to pick.
 
         Returns:
             Each loss in nats. `stop` is present only in steps with a final observation.
@@ -160,7 +162,7 @@ class Trainer:
         return values
 
     def _take(self, samples: Sequence[LabelledImage], finals: Sequence[Pictured]) -> _Draw:
-        """The draw of this step; starts preparing the next one."""
+        """Returns the sample of this step, and starts to prepare that of the next step."""
         prepared = self._prepared
         if prepared and prepared.step == self.step_count and prepared.of(samples, finals):
             draw = prepared.draw.result()
@@ -174,7 +176,7 @@ class Trainer:
     def _draw(
         self, step: int, samples: Sequence[LabelledImage], finals: Sequence[Pictured]
     ) -> _Draw:
-        """The draw of a step: a random sample, augmented, and perhaps a final observation."""
+        """Draws and augments the sample of a step, and in some steps a final observation."""
         random = np.random.default_rng([self.seed, step])
         sample = augment(
             samples[int(random.integers(len(samples)))],

@@ -1,4 +1,5 @@
-"""Errors of a policy's predictions against an expert, on unseen observations."""
+"""Measures how far a policy's predictions deviate from an expert's actions, on observations that
+were not used for training."""
 
 from __future__ import annotations
 
@@ -20,18 +21,20 @@ ERRORS = ("pick_mm", "pick_deg", "place_mm", "rotation_deg", "displacement_mm")
 _ARM = 50.0
 """The mean distance of a tool's points from its grasp, in mm; converts angles to displacements."""
 _LOST = 20.0
-"""Displacements are clipped to this, in mm: the object is lost."""
+"""Displacements are clipped to this, in mm, because an object that is farther off counts as
+lost."""
 
 
 def prediction_errors(
     decision: Decision, targets: Sequence[LabelledImage], millimetres: float
 ) -> NDArray[np.float64]:
-    """Errors of a prediction against the target with the nearest pick, ignoring a stop.
+    """Errors of a prediction relative to the target with the nearest pick. A decision to stop is
+    ignored.
 
     Args:
         decision: the prediction.
         targets: the expert's possible actions.
-        millimetres: the side of a pixel.
+        millimetres: the side of a pixel, in mm.
 
     Returns:
         (5,), in the order of `ERRORS`, in mm and degrees:
@@ -39,7 +42,7 @@ def prediction_errors(
         - the distance between the picks;
         - the error of the pick angle, modulo pi;
         - the distance of the placed object from the expert's place;
-        - the error of its rotation;
+        - the error of the object's rotation;
         - the resulting displacement of the object's points, at most 20 mm.
     """
 
@@ -68,16 +71,17 @@ def prediction_errors(
 
 
 def choose_stop_threshold(present: ArrayLike, absent: ArrayLike) -> float | None:
-    """The log-odds below which a policy should stop.
+    """Chooses the log-odds below which a policy should stop.
 
     Args:
         present: the log-odds of scenes with something to pick.
         absent: the log-odds of final observations.
 
     Returns:
-        The threshold with the fewest errors; None if either kind is missing. It lies a quarter of
-        the way from the log-odds below it to those above. Of several such thresholds it is the
-        lowest, because an unneeded action costs less than a forgotten object.
+        The threshold with the fewest wrong decisions; None if `present` or `absent` is empty. It
+        lies a quarter of the way from the next lower to the next higher log-odds. If several
+        thresholds have equally few wrong decisions, it is the lowest, because an unneeded action
+        costs less than a forgotten object.
     """
     present, absent = np.sort(np.asarray(present, float)), np.sort(np.asarray(absent, float))
     if not len(present) or not len(absent):
@@ -97,8 +101,8 @@ def validate(
 
     Args:
         policy: the policy; its stop threshold, if it has one, is ignored.
-        scenes: at least one.
-        finals: observations with nothing left to pick; empty if the networks cannot stop.
+        scenes: at least one scene.
+        finals: observations in which nothing is left to pick; empty if the networks cannot stop.
 
     Returns:
         - `median_...` and `p95_...` for each of `ERRORS`: its median and 95th percentile;
@@ -141,7 +145,7 @@ def mean_loss(networks: Networks, samples: Sequence[LabelledImage]) -> float:
 
     Args:
         networks: the networks of any method, for inference.
-        samples: at least one, prepared as for training.
+        samples: at least one sample, prepared as for training.
     """
     values = [
         sum(float(loss()) for _, loss in networks.losses(sample, np.random.default_rng(index)))

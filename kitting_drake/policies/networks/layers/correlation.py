@@ -1,9 +1,9 @@
 """Lifting and cross-correlation: the placing module's last step (equations 7 and 8 of the paper).
 
-`cross_correlation` computes the full correlation. `search` finds its largest values without
-computing all of it. It computes a coarse volume by FFT, at half the resolution and a fixed number
+`cross_correlation` computes the full correlation. `search` finds the largest values without
+computing all of them. It computes a coarse volume by FFT, at half the resolution and a fixed number
 of rotations, and evaluates the full correlation only around the coarse volume's best cells. Its
-cost barely grows with N.
+cost barely grows with the number of orientations N.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _REACH = 4
 
 
 def lift(encoding: Tensor, angles: Tensor, size: int) -> Tensor:
-    """R_N (equation 7): the encoding rotated about its centre with bilinear sampling.
+    """Rotates an encoding about its centre with bilinear sampling, R_N of equation 7.
 
     Args:
         encoding: (1, channels, side, side); the side is odd, so the centre is a pixel.
@@ -54,7 +54,7 @@ def lift(encoding: Tensor, angles: Tensor, size: int) -> Tensor:
 
 
 def cross_correlation(scene: Tensor, kernels: Tensor) -> Tensor:
-    """Equation 8, computed directly.
+    """Computes the cross-correlation of equation 8 directly.
 
     Args:
         scene: (1, channels, rows, cols), phi(o_t).
@@ -68,7 +68,8 @@ def cross_correlation(scene: Tensor, kernels: Tensor) -> Tensor:
 
 
 def cross_correlation_fft(scene: Tensor, kernels: Tensor) -> Tensor:
-    """Equation 8 by fast Fourier transforms; same result as `cross_correlation`."""
+    """Computes the cross-correlation of equation 8 by fast Fourier transforms. The result equals
+    that of `cross_correlation`."""
     reach = kernels.shape[-1] // 2
     return _FourierCorrelation.apply(F.pad(scene[0], 4 * (reach,)), kernels) / KERNEL
 
@@ -76,13 +77,13 @@ def cross_correlation_fft(scene: Tensor, kernels: Tensor) -> Tensor:
 class _FourierCorrelation(torch.autograd.Function):
     """Cross-correlation without padding, by fast Fourier transforms.
 
-    Its gradients also use transforms of real signals, and no transform touches zero or unneeded
-    rows. Autograd through `torch.fft` would do three times the work.
+    Its gradients also use transforms of real signals, and the transforms skip rows that are zero or
+    not needed. Autograd through `torch.fft` would do three times the work.
     """
 
     @staticmethod
     def forward(ctx: Any, scene: Tensor, kernels: Tensor) -> Tensor:
-        """(channels, rows, cols) and (n, channels, height, width) to
+        """Maps a scene (channels, rows, cols) and kernels (n, channels, height, width) to
         (n, rows - height + 1, cols - width + 1)."""
         rows, cols = scene.shape[-2:]
         shape = (next_fast_len(rows, real=True), next_fast_len(cols, real=True))
@@ -116,15 +117,15 @@ class _FourierCorrelation(torch.autograd.Function):
 def _spectrum(signals: Tensor, shape: tuple[int, int]) -> Tensor:
     """The transposed `torch.fft.rfft2` of signals that are zero-padded to a shape."""
     along_rows = torch.fft.rfft(signals, n=shape[1]).mT
-    # The transpose makes each transform read and write contiguous memory.
+    # Because of the transpose each transform reads and writes contiguous memory.
     return torch.fft.fft(F.pad(along_rows, (0, shape[0] - signals.shape[-2])))
 
 
 def _first_lags(spectra: Tensor, shape: tuple[int, int], lags: tuple[int, int]) -> Tensor:
-    """The first entries of correlations.
+    """Computes the first entries of correlations from their spectra.
 
     Args:
-        spectra: the transposed complex conjugates of their spectra.
+        spectra: the transposed complex conjugates of the correlations' spectra.
         shape: rows and cols of the transforms.
         lags: the number of rows and cols to compute.
     """
@@ -150,15 +151,15 @@ _halve = BlurPool()
 
 
 def coarse_volume(scene: Tensor, encoding: Tensor, angles: Tensor) -> Tensor:
-    """The correlation at half the resolution, scaled to approximate the full one.
+    """The correlation at half the resolution, scaled so that it approximates the full correlation.
 
     Args:
-        scene: (1, channels, rows, cols), odd sides.
+        scene: (1, channels, rows, cols) with odd sides.
         encoding: (1, channels, side, side).
-        angles: (n,).
+        angles: (n,) rotations, counter-clockwise, in radians.
 
     Returns:
-        (n, (rows + 1) / 2, (cols + 1) / 2): cell (i, j) is at pixel (2 i, 2 j).
+        (n, (rows + 1) / 2, (cols + 1) / 2); cell (i, j) corresponds to pixel (2 i, 2 j).
     """
     halve = _halve.to(scene.device)
     kernels = lift(halve(encoding), angles, KERNEL // 2 + 1)
@@ -173,7 +174,7 @@ def window(
     Args:
         scene: (1, channels, rows, cols).
         encoding: (1, channels, side, side).
-        angles: (n,).
+        angles: (n,) rotations, counter-clockwise, in radians.
         corner: the window's first pixel (row, col); the scene is zero outside its image.
         shape: the window's rows and cols.
 
@@ -191,8 +192,8 @@ def kernel_window(
     Args:
         scene: (1, channels, rows, cols).
         kernels: (n, channels, KERNEL, KERNEL).
-        corner: as for `window`.
-        shape: as for `window`.
+        corner: the window's first pixel (row, col).
+        shape: the window's rows and cols.
 
     Returns:
         (n, *shape).
@@ -204,14 +205,16 @@ def kernel_window(
     part = scene[:, :, vertical[0], horizontal[0]]
     padded = F.pad(part, (*horizontal[1], *vertical[1]))
     if kernels.requires_grad:
-        # The gradients of conv2d with so large a kernel take three times as long.
+        # With such a large kernel, the gradients of conv2d would take three times as long.
         return _FourierCorrelation.apply(padded[0], kernels) / KERNEL
-    # U-net outputs are channels_last, in which so large a kernel is much slower.
+    # The U-nets' outputs are channels_last, a format in which conv2d with such a large kernel is
+    # much slower.
     return F.conv2d(padded.contiguous(), kernels.contiguous())[0] / KERNEL
 
 
 def _overlap(start: int, length: int, side: int) -> tuple[slice, tuple[int, int]]:
-    """The slice of an axis of `side` pixels within a span, and the padding before and after it."""
+    """The slice of an axis of `side` pixels that lies within a span, and the padding before and
+    after it that fills the span."""
     first = min(max(start, 0), side)
     last = min(max(start + length, first), side)
     before = min(max(-start, 0), length)
@@ -223,9 +226,10 @@ class Candidate:
     """A window of the full correlation around one of its peaks."""
 
     scores: Tensor
-    """(n, rows, cols): n successive rotations."""
+    """(n, rows, cols): the scores at n successive rotations."""
     first_bin: int
-    """The rotation of `scores[0]` in bins. It is cyclic, so it may be negative or exceed N."""
+    """The rotation of `scores[0]`, in bins. Rotations are cyclic, so it may be negative or exceed
+    N."""
     corner: tuple[int, int]
     """The pixel (row, col) of `scores[:, 0, 0]`; all pixels lie in the scene."""
 
@@ -236,7 +240,7 @@ class Candidate:
         return score, self.first_bin + rotation, self.corner[0] + row, self.corner[1] + col
 
     def known_neighbours(self) -> int:
-        """How many of the maximum's 27 neighbours (itself included) lie within the window."""
+        """How many cells of the block of 27 around the maximum lie within the window."""
         at = _argmax(self.scores)
         return math.prod(
             min(i + 2, n) - max(i - 1, 0) for i, n in zip(at, self.scores.shape, strict=True)
@@ -244,14 +248,14 @@ class Candidate:
 
 
 def ranked(candidates: Iterable[Candidate], orientations: int) -> list[Candidate]:
-    """The candidates, best first, one for each cell.
+    """Sorts candidates, best first, and keeps one for each position and rotation of a maximum.
 
     Overlapping windows may have the same maximum, possibly at the edge of one of them. The window
-    with most neighbours of the maximum is kept, because sub-pixel refinement needs them.
+    with the most neighbours of the maximum is kept, because sub-pixel refinement needs them.
 
     Args:
         candidates: windows around the peaks of the coarse volume.
-        orientations: N.
+        orientations: N, the number of orientations.
     """
     of_cell: dict[tuple[int, int, int], Candidate] = {}
     for candidate in candidates:
@@ -269,7 +273,8 @@ def _argmax(volume: Tensor) -> tuple[int, int, int]:
 
 
 def peaks(volume: Tensor, count: int) -> Iterator[tuple[int, int, int]]:
-    """(rotation, row, col) of the largest values of a volume, largest first, none adjacent.
+    """Yields (rotation, row, col) of the largest values of a volume, largest first. No two are
+    adjacent.
 
     Args:
         volume: (n, rows, cols), over a full rotation.
@@ -293,7 +298,7 @@ def finer_bins(rotation: int, coarse: int, orientations: int) -> tuple[int, int]
     Args:
         rotation: the coarse rotation, in coarse bins.
         coarse: the number of coarse bins over a full rotation.
-        orientations: N.
+        orientations: N, the number of orientations.
     """
     first = math.floor((rotation - 1) * orientations / coarse)
     return first, math.ceil((rotation + 1) * orientations / coarse)
@@ -327,7 +332,7 @@ def search(
     Args:
         scene: (1, channels, rows, cols), odd sides, phi(o_t).
         encoding: (1, channels, side, side), psi(c).
-        orientations: N.
+        orientations: N, the number of orientations.
         shape: searches only the first rows and cols; all by default.
         candidates: the number of coarse peaks to refine.
 

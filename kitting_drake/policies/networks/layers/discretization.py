@@ -19,16 +19,17 @@ from kitting_drake.policies.networks.layers.fibres import fourier_basis
 def discretization_matrix(
     orientations: int, frequencies: Sequence[int], *, quotient: int = 1
 ) -> NDArray[np.float64]:
-    """Q of the paper, the matrix of Dis from SO(2) to C_N (equations 5, 6), or for a quotient.
+    """The matrix Q of the paper, which discretizes a function on SO(2), or on a quotient of it, to
+    N angles (equations 5 and 6).
 
     Args:
         orientations: N, the number of bins over a full rotation.
-        frequencies: j of the irreps, ascending.
-        quotient: 2 for SO(2)/C_2 to C_N/C_2. The matrix then has only the bins 0 to N/2 - 1, at the
-            angles 2 pi i / N, and every frequency must be even.
+        frequencies: frequencies j of the irreps, ascending.
+        quotient: order of the subgroup; 2 maps SO(2)/C_2 to C_N/C_2. The matrix then has only the
+            bins 0 to N/2 - 1, at the angles 2 pi i / N, and every frequency must be even.
 
     Returns:
-        (N / quotient, d).
+        (N / quotient, d), where d is the dimension of the irreps.
 
     Raises:
         ValueError: N or a frequency is not a multiple of `quotient`, or N / quotient is too small
@@ -41,7 +42,7 @@ def discretization_matrix(
         raise ValueError(f"frequency {odd[0]} is not a frequency of SO(2)/C_{quotient}")
     bins = orientations // quotient
     size = sum(2 if j else 1 for j in frequencies)
-    # The band limit within the quotient's own period.
+    # The band limit, counted within the period of the quotient.
     needed = max(size, 2 * (max(frequencies) // quotient) + 1)
     if bins < needed:
         raise ValueError(
@@ -55,10 +56,11 @@ def discretization_matrix(
 def discretize(
     coefficients: Tensor, orientations: int, frequencies: Sequence[int], *, quotient: int = 1
 ) -> Tensor:
-    """Dis (equation 6): maps an irrep vector to a regular one.
+    """Maps a vector of irreps to a vector of the regular representation (Dis, equation 6 of the
+    paper).
 
     Args:
-        coefficients: (..., d).
+        coefficients: (..., d) Fourier coefficients.
         orientations: as for `discretization_matrix`.
         frequencies: as for `discretization_matrix`.
         quotient: as for `discretization_matrix`.

@@ -36,8 +36,8 @@ class Fibre(Protocol):
         """(size, channels): the left inverse of `synthesis`; it projects onto the irreps."""
 
     def invariant(self) -> NDArray[np.float64]:
-        """(channels,): the rotation-invariant functional. It gives the coefficient of frequency 0,
-        scaled as in escnn's Fourier ELU."""
+        """(channels,): weights of the rotation-invariant sum of the channels. The sum is the
+        coefficient of frequency 0, scaled as in escnn's FourierELU."""
 
 
 @dataclass(frozen=True)
@@ -65,10 +65,10 @@ class Irreps:
     """
 
     frequencies: tuple[int, ...]
-    """j of each rho_j, ascending."""
+    """The frequency j of each irrep rho_j, ascending."""
     samples: int = 0
-    """The number of stored, evenly spaced samples of the band-limited function; 0 stores the
-    coefficients themselves."""
+    """The number of evenly spaced samples by which the band-limited function is stored. If it is 0,
+    the coefficients themselves are stored."""
 
     def __post_init__(self) -> None:
         if list(self.frequencies) != sorted(set(self.frequencies)) or min(self.frequencies) < 0:
@@ -92,7 +92,7 @@ class Irreps:
             return np.eye(self.size)
         angles = 2 * np.pi * np.arange(self.samples) / self.samples
         columns = fourier_basis(angles, self.frequencies)
-        # Orthogonal columns of equal norm, scaled as escnn's FourierPointwise scales them.
+        # Scale the orthogonal columns to equal norms, as escnn's FourierPointwise does.
         columns[:, [0] if self.frequencies[0] == 0 else []] /= math.sqrt(2)
         return columns * math.sqrt(2 / self.size)
 
@@ -139,10 +139,11 @@ def fourier_basis(angles: NDArray[np.float64], frequencies: Sequence[int]) -> ND
 
     Args:
         angles: (n,), in radians.
-        frequencies: ascending.
+        frequencies: the frequencies j, ascending.
 
     Returns:
-        (n, d): a column of cosines for each frequency, followed by sines if the frequency is not 0.
+        (n, d): a column of cosines for each frequency, followed by sines if the frequency is
+        not 0.
     """
     columns = []
     for j in frequencies:

@@ -1,4 +1,5 @@
-"""The maximum of a Fourier series: the continuous limit of the discretization. Needs no torch."""
+"""Finds the maximum of a Fourier series, which is the continuous limit of the discretization. This
+module does not need torch."""
 
 from __future__ import annotations
 
@@ -16,12 +17,13 @@ def series_maximum(coefficients: NDArray[np.float64], frequencies: Sequence[int]
 
     Args:
         coefficients: (d,), in the order of `fourier_basis`.
-        frequencies: ascending.
+        frequencies: the frequencies of the series, ascending.
 
     Returns:
-        Radians in [0, 2 pi). A series on a quotient has several equal maxima; this is the first.
+        The angle in [0, 2 pi), in radians. A series on a quotient has several equal maxima; this is
+        the first.
     """
-    # On a quotient the period is shorter: search one period only.
+    # On a quotient the period is shorter, so search only one period.
     period = math.gcd(*frequencies) or 1
     reduced = np.array(frequencies) // period
     count = 32 * max(int(reduced.max()), 1)
@@ -34,7 +36,7 @@ def series_maximum(coefficients: NDArray[np.float64], frequencies: Sequence[int]
 
     best, largest = 0.0, -math.inf
     for peak in peaks:
-        # Newton's method; no step goes beyond the neighbouring samples.
+        # Apply Newton's method, in which no step goes beyond the neighbouring samples.
         angle = math.tau * float(peak) / count
         for _ in range(8):
             terms = evaluate(angle)
@@ -57,7 +59,7 @@ def series_maximum(coefficients: NDArray[np.float64], frequencies: Sequence[int]
 def _complex_weights(
     coefficients: NDArray[np.float64], frequencies: Sequence[int]
 ) -> NDArray[np.complex128]:
-    """w_j with f(angle) = sum of Re(w_j exp(i j angle))."""
+    """The weights w_j with which the series is the sum over j of Re(w_j exp(i j angle))."""
     weights = np.zeros(len(frequencies), complex)
     index = 0
     for position, j in enumerate(frequencies):

@@ -23,7 +23,7 @@ from kitting_drake.policies.networks.layers.steerable import ExpandedConv2d, ker
 
 
 class GroupConv2d(ExpandedConv2d):
-    """The counterpart of `SteerableConv2d` for regular fields of one cyclic group, and scalars.
+    """A convolution like `SteerableConv2d`, for regular fields of one cyclic group and for scalars.
 
     At most one of the two fibres may be scalar.
     """
@@ -46,7 +46,8 @@ class GroupConv2d(ExpandedConv2d):
         elif isinstance(self.out_fibre, Scalar):
             kernel = torch.einsum("oib,nbxy->oxyin", self.weights, self.basis)
         else:
-            # The cyclic shifts of kappa are windows of kappa repeated twice; shift m starts at -m.
+            # The cyclic shifts of kappa are windows of kappa repeated twice. The window of shift m
+            # starts at -m.
             kappa = self.weights.unflatten(2, self.basis.shape[:2])
             cyclic = torch.cat([kappa, kappa], dim=2).unfold(2, len(self.basis), 1)
             kernel = torch.einsum("oimbn,mbxy->omxyin", cyclic[:, :, 1:].flip(2), self.basis)
@@ -56,8 +57,8 @@ class GroupConv2d(ExpandedConv2d):
 
     @torch.no_grad()
     def fit(self, kernel: Tensor) -> None:
-        # The first channel of each output field is not rotated and determines all weights. A fit to
-        # all channels would take 20 GB at N = 180.
+        # Use only the first channel of each output field, which is not rotated and determines all
+        # weights. A fit to all channels would take 20 GB at N = 180.
         first = kernel[:: self.out_fibre.channels].unflatten(1, (self.weights.shape[1], -1))
         if isinstance(self.out_fibre, Scalar):
             first = first[:, :, :1]
@@ -78,7 +79,7 @@ def rotated_patterns(fibre: Regular, size: int) -> Tensor:
         (M, B, size, size), float64: B patterns, each rotated counter-clockwise by 2 pi m / N.
     """
     reach = size // 2
-    # An upper bound: escnn itself keeps about as many frequencies as the radius in pixels.
+    # This is an upper bound: escnn itself keeps about as many frequencies as the radius has pixels.
     frequencies = tuple(range(0, 3 * reach + 1, fibre.quotient))
     pairs = kernel_basis(Scalar(), Irreps(frequencies), size)[:, :, 0]
     angles = 2 * math.pi * torch.arange(fibre.size, dtype=torch.float64) / fibre.order

@@ -1,4 +1,4 @@
-"""escnn for planar groups. All other modules import escnn from here.
+"""Imports escnn for planar groups. All other modules import escnn from here.
 
 escnn imports lie_learn, but uses it for SO(3) only. lie_learn 0.0.2 fails to load with numpy 2 and
 has no wheel for Python 3.13 (see QUVA-Lab/escnn#80 and AMLab-Amsterdam/lie_learn#30). This module

@@ -31,7 +31,7 @@ Convolution = Callable[..., nn.Module]
 
 
 _TOGETHER = 64
-"""The most channels that `BandLimit` and `InvariantPart` combine in one product."""
+"""The largest number of channels that `BandLimit` and `InvariantPart` combine in one product."""
 
 
 class ExpandedConv2d(nn.Module):
@@ -80,19 +80,20 @@ class ExpandedConv2d(nn.Module):
         raise NotImplementedError
 
     def kernel(self, dtype: torch.dtype = torch.float32) -> Tensor:
-        """The plain kernel: (out channels, in channels, size, size), in channels_last."""
+        """The expanded kernel (out channels, in channels, size, size), in the memory format
+        channels_last."""
         raise NotImplementedError
 
     def fit(self, kernel: Tensor) -> None:
-        """Sets the weights to those of a plain kernel of such a layer.
+        """Sets the weights so that the layer has a given expanded kernel.
 
         Args:
-            kernel: as `kernel` returns it.
+            kernel: a kernel with the shape of `kernel()` that lies in the span of the basis.
         """
         raise NotImplementedError
 
     def channel_bias(self) -> Tensor | None:
-        """(out channels,); None without a bias."""
+        """(out channels,) bias of each channel; None if the layer has no bias."""
         return None if self.bias is None else self.bias.repeat_interleave(self.out_fibre.channels)
 
     def forward(self, features: Tensor) -> Tensor:
@@ -111,10 +112,10 @@ class SteerableConv2d(ExpandedConv2d):
 
     def _make_basis(self, in_fields: int, size: int) -> tuple[Tensor, int, float]:
         basis = kernel_basis(self.in_fibre, self.out_fibre, size)
-        # The samples of a field are correlated: they follow from its coefficients, which are fewer.
+        # The samples of a field are correlated, because they are computed from fewer coefficients.
         repeated = self.in_fibre.channels / self.in_fibre.size
         gathered = in_fields * float(basis.square().sum()) * repeated / self.out_fibre.channels
-        # The memory order that `expand_kernel` needs.
+        # Store the basis in the memory order that `expand_kernel` needs.
         order = basis.permute(0, 1, 3, 4, 2).to(torch.get_default_dtype()).contiguous()
         return order.permute(0, 1, 4, 2, 3), len(basis), math.sqrt(2 / gathered)
 
@@ -132,7 +133,7 @@ class SteerableConv2d(ExpandedConv2d):
 
 
 def expand_kernel(weights: Tensor, basis: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
-    """A plain kernel from weights in a basis.
+    """Expands weights in a basis to a plain kernel.
 
     Args:
         weights: (out fields, in fields, D).
@@ -155,7 +156,7 @@ def expand_kernel(weights: Tensor, basis: Tensor, dtype: torch.dtype = torch.flo
 
 
 class PlainConv2d(nn.Conv2d):
-    """The plain convolution of an `ExpandedConv2d`, for inference.
+    """A plain convolution with the expanded kernel of an `ExpandedConv2d`, for inference.
 
     It computes in the type of its input and casts its weights at every call if necessary.
     `MixedPrecision.cast` casts them once.
@@ -191,7 +192,8 @@ class PlainConv2d(nn.Conv2d):
 @functools.lru_cache(maxsize=64)
 @torch.inference_mode(False)  # escnn caches tensors, which must work outside inference mode too.
 def kernel_basis(in_fibre: Fibre, out_fibre: Fibre, size: int) -> Tensor:
-    """escnn's basis of the steerable kernels between two fibres, with the transforms folded in.
+    """escnn's basis of the steerable kernels between two fibres, with the Fourier transforms folded
+    in.
 
     Returns:
         (D, out channels, in channels, size, size), float64.
@@ -242,9 +244,9 @@ def kernel_basis(in_fibre: Fibre, out_fibre: Fibre, size: int) -> Tensor:
 def frequencies_cutoff(in_fibre: Fibre, out_fibre: Fibre, size: int) -> float | None:
     """The largest angular frequency of the kernels on a ring of pixels, per pixel of its radius.
 
-    A kernel of angular frequency k maps rho_i to rho_j with j up to i + k. With escnn's own limit
-    the highest output frequencies may be out of reach, so that they are always zero. The limit is
-    then raised to what they need on the outermost ring: higher frequencies would alias there.
+    A kernel of angular frequency k maps rho_i to rho_j with j up to i + k. With escnn's own limit,
+    the highest output frequencies may be unreachable and so always zero. The limit is then raised
+    to the value that they need on the outermost ring. Higher frequencies would alias there.
 
     Returns:
         The limit; None for escnn's own.
@@ -266,7 +268,8 @@ class MixedPrecision(nn.Module):
         raise NotImplementedError
 
     def cast(self, compute_type: torch.dtype) -> None:
-        """Casts these submodules permanently to the type of the inputs."""
+        """Casts the submodules of `reduced_precision_parts` permanently to the type of the
+        inputs."""
         for part in self.reduced_precision_parts():
             part.to(compute_type).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
@@ -283,7 +286,7 @@ class BandLimit(nn.Module):
         self.register_buffer("projection", _of_several_fields(projection, fields), persistent=False)
 
     def forward(self, features: Tensor) -> Tensor:
-        """(batch, fields * channels, rows, cols) to the same shape."""
+        """Maps (batch, fields * channels, rows, cols) to the same shape."""
         return features if self.trivial else _multiply_fields(features, self.projection)
 
 
@@ -298,15 +301,15 @@ class InvariantPart(nn.Module):
         self.register_buffer("functional", _of_several_fields(functional, fields), persistent=False)
 
     def forward(self, features: Tensor) -> Tensor:
-        """(batch, fields * channels, rows, cols) to (batch, fields, rows, cols)."""
+        """Maps (batch, fields * channels, rows, cols) to (batch, fields, rows, cols)."""
         return _multiply_fields(features, self.functional)
 
 
 def _of_several_fields(matrix: NDArray[np.float64], fields: int) -> Tensor:
     """The block-diagonal matrix that applies a matrix to each of several fields.
 
-    It combines about 64 channels. Although it is mostly zeros, this takes half as long as products
-    with eight channels each.
+    It combines about 64 channels. Although most of its entries are zero, one such product takes
+    half as long as several products with eight channels each.
     """
     together = math.gcd(fields, max(_TOGETHER // len(matrix), 1))
     blocks = np.kron(np.eye(together), matrix)
@@ -342,7 +345,7 @@ class BlurPool(nn.Module):
         self.register_buffer("kernel", kernel / kernel.sum(), persistent=False)
 
     def forward(self, features: Tensor) -> Tensor:
-        """(batch, channels, rows, cols), odd sides, to half the resolution."""
+        """Maps (batch, channels, rows, cols) with odd sides to half the resolution."""
         return _Blur.apply(features, self.kernel)
 
 
@@ -368,13 +371,15 @@ class _Blur(torch.autograd.Function):
 
 
 def upsample(features: Tensor) -> Tensor:
-    """Bilinear upsampling from n + 1 pixels to 2 n + 1: inverts `BlurPool`'s change of size."""
+    """Upsamples bilinearly from n + 1 pixels to 2 n + 1, which reverses `BlurPool`'s change of
+    size."""
     rows, cols = features.shape[2:]
     larger = F.interpolate(
         features, size=(2 * rows - 1, 2 * cols - 1), mode="bilinear", align_corners=True
     )
     if larger.requires_grad:
-        # The gradient of a part of a concatenation is not contiguous, which slows torch down.
+        # If the result is concatenated, its gradient is not contiguous, which slows torch down.
+        # Make it contiguous.
         larger.register_hook(
             lambda gradient: gradient.contiguous(memory_format=torch.channels_last)
         )
