@@ -1,1 +1,1 @@
-"""Shared code: files, processes, errors, paths, command lines."""
+"""Code that all other packages share: files, processes, errors, paths and command lines."""

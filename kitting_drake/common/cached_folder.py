@@ -1,4 +1,5 @@
-"""A cache of folders that can be recreated. They appear atomically; the oldest are removed."""
+"""A cache of folders that can be recreated. Folders appear atomically, and the oldest ones are
+removed."""
 
 import contextlib
 import os
@@ -11,10 +12,10 @@ from pathlib import Path
 from kitting_drake.common.errors import MachineError
 
 KEPT_ENTRIES = 1000
-"""Number of folders that `prune` keeps."""
+"""Number of newest folders that `prune` always keeps."""
 
 YOUNGEST_REMOVED = 3600.0
-"""`prune` removes no folder younger than this, in seconds: a running process may need it."""
+"""`prune` keeps folders younger than this, in seconds, because a running process may need them."""
 
 _SCRATCH = ".making-"
 
@@ -22,18 +23,20 @@ _SCRATCH = ".making-"
 def cached_folder(final: Path, files: Sequence[str], write: Callable[[Path], object]) -> Path:
     """Returns a folder of the cache, after creating it if it is missing or damaged.
 
-    The folder appears atomically, so several processes may create it at once. Every use renews its
-    modification time, by which `prune` chooses.
+    The folder appears atomically, so several processes may create it at the same time. Every use
+    renews its modification time, so that `prune` removes the folders that have not been used for
+    longest.
 
     Args:
         final: the folder. Its name must identify its content.
-        files: the names of the files in it.
+        files: the names of the files in the folder.
         write: writes the files into an empty folder.
 
     Raises:
         MachineError: the cache is not writable.
     """
-    # Renew it first, so that another process does not remove it in between.
+    # Renew the modification time first, so that another process does not remove the folder
+    # meanwhile.
     with contextlib.suppress(OSError):
         os.utime(final)
     if _is_complete(final, files):
@@ -45,7 +48,7 @@ def cached_folder(final: Path, files: Sequence[str], write: Callable[[Path], obj
             scratch.mkdir()
             write(scratch)
             if final.exists() and not _is_complete(final, files):
-                # After a power failure files may be empty.
+                # The folder is damaged: after a power failure, for example, files may be empty.
                 os.rename(final, Path(folder) / "damaged")
             os.rename(scratch, final)
     except OSError as error:
@@ -64,8 +67,8 @@ def _is_complete(folder: Path, files: Sequence[str]) -> bool:
 def prune(parent: Path) -> None:
     """Removes the least recently used folders in `parent`.
 
-    It keeps the newest `KEPT_ENTRIES` and all younger than `YOUNGEST_REMOVED`. Scratch folders of
-    killed processes are removed at the same age.
+    It keeps the newest `KEPT_ENTRIES` folders, and all that are younger than `YOUNGEST_REMOVED`.
+    Scratch folders of killed processes are removed once they are older than that.
     """
     entries: list[tuple[float, Path]] = []
     for path in parent.iterdir():

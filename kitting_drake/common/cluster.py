@@ -1,4 +1,4 @@
-"""`Workers` on a Ray cluster. Only this module needs Ray."""
+"""Runs functions on a Ray cluster. Only this module needs Ray."""
 
 import importlib
 import logging
@@ -22,7 +22,7 @@ from kitting_drake.common.provenance import versions
 _Result = TypeVar("_Result")
 
 _RETRIES = 5
-"""How often a call is retried if its node or worker dies."""
+"""Number of retries of a call whose node or worker dies."""
 
 _PATIENCE = 5.0
 """Timeout for connecting to the cluster's address, in s."""
@@ -30,7 +30,8 @@ _PATIENCE = 5.0
 
 @dataclass(frozen=True)
 class _Unfit:
-    """The result of a call on a node that lacks something."""
+    """The result of a call on a node that cannot run it, for example because a package is missing
+    there."""
 
     reason: str
 
@@ -38,15 +39,16 @@ class _Unfit:
 class RayWorkers:
     """The CPUs of a Ray cluster, as `Workers`. Use it in a `with` statement.
 
-    A call occupies one CPU and runs in a fresh process. If its node dies, it is retried on another.
-    Only this process writes files.
+    A call occupies one CPU and runs in a fresh process. If its node dies, the call is retried on
+    another node. Only this process writes files.
     """
 
     def __init__(self, address: str, runtime_env: dict[str, Any]) -> None:
         """
         Args:
             address: `auto`, `HOST:PORT` or `ray://HOST:PORT`.
-            runtime_env: Ray's environment of the workers; its `working_dir` contains this package.
+            runtime_env: Ray's runtime environment of the workers. Its `working_dir` contains this
+                package.
         """
         self._address = address
         self._runtime_env = runtime_env
@@ -61,7 +63,8 @@ class RayWorkers:
         Raises:
             UserError: Ray is not installed, there is no such cluster, or it rejects the files.
         """
-        # Ray reports a dead node in one message. This keeps it from also printing the node's log.
+        # Ray reports a dead node in one message. This setting keeps it from also printing the
+        # node's log.
         os.environ.setdefault("RAY_DEDUP_LOGS_SKIP_REGEX", "Raylet is terminated")
         self._ray = import_extra("ray", purpose="--ray", extra="cluster")
         address = _find_cluster(self._address)
@@ -101,7 +104,7 @@ class RayWorkers:
             outcome = self._ray.get(answer)
         except (exceptions.RayTaskError, exceptions.RuntimeEnvSetupError) as error:
             last_line = str(error).strip().splitlines()[-1]
-            raise UserError(f"a node of the cluster cannot work: {last_line}") from error
+            raise UserError(f"a node of the cluster cannot run the work: {last_line}") from error
         except exceptions.RayError:
             # All retries failed, or the call was cancelled.
             return ProcessCrashed(-signal.SIGKILL)
@@ -123,7 +126,8 @@ class RayWorkers:
 
 
 def _find_cluster(address: str) -> str:
-    """The address of a running cluster. This fails fast, whereas Ray itself retries for minutes.
+    """Finds the address of a running cluster. If there is none, this function fails at once,
+    whereas Ray retries for minutes.
 
     Raises:
         UserError: nothing listens at the address, or no cluster runs on this machine.
@@ -155,13 +159,15 @@ def _name(function: Callable[..., object]) -> tuple[str, str]:
     """The module and name by which another process can import a function."""
     module = function.__module__
     if module == "__main__":
-        # `python -m` names the module __main__, but only in this process.
+        # With `python -m` the module is called `__main__`, but only in this process. Use its real
+        # name.
         module = sys.modules["__main__"].__spec__.name  # type: ignore[union-attr]
     return module, function.__qualname__
 
 
 def _serve(versions_wanted: dict[str, str], call: bytes) -> bytes | ProcessCrashed:
-    """Runs a call on a node. Passes call and result on as bytes, so that it needs few imports."""
+    """Runs a call on a node. Call and result are passed as bytes, so that this function needs few
+    imports."""
     return run_in_subprocess(_answer, versions_wanted, call)
 
 
@@ -171,7 +177,7 @@ def _answer(versions_wanted: dict[str, str], call: bytes) -> bytes:
     try:
         found = versions()
         if found != versions_wanted:
-            # Look at the names of both sides: a package may be installed on one side only.
+            # Compare the packages of both sides, because a package may be installed on only one.
             names = (*versions_wanted, *found)
             name = next(key for key in names if found.get(key) != versions_wanted.get(key))
             there, here = (which.get(name, "none") for which in (found, versions_wanted))
@@ -185,7 +191,7 @@ def _answer(versions_wanted: dict[str, str], call: bytes) -> bytes:
         chosen = operator.attrgetter(function)(importlib.import_module(module))
         answer = chosen(*arguments)
     except MachineError as error:
-        return pickle.dumps(_Unfit(f"the node {node} cannot work: {error}"))
+        return pickle.dumps(_Unfit(f"the node {node} cannot run the work: {error}"))
     except ImportError as error:
         return pickle.dumps(
             _Unfit(f"the node {node} cannot import a module: {error}: install it there")

@@ -12,7 +12,7 @@ from kitting_drake.common.errors import UserError
 from kitting_drake.common.seeds import ALL_SEEDS
 
 FAILED = 1
-"""Exit code if a simulation or a policy failed."""
+"""Exit code after a failed simulation or policy."""
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as in shells."""
@@ -46,7 +46,8 @@ def interrupts_wait() -> Iterator[Callable[[], bool]]:
     """Defers the first Ctrl-C or SIGTERM until the caller is ready; the second one interrupts.
 
     Yields:
-        A function that says whether a signal came. The caller then raises KeyboardInterrupt.
+        A function that returns whether a signal has arrived. If so, the caller should raise
+        KeyboardInterrupt.
     """
     came = False
 
@@ -58,7 +59,7 @@ def interrupts_wait() -> Iterator[Callable[[], bool]]:
 
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     for number, handler in before.items():
-        # A shell's background jobs ignore Ctrl-C.
+        # Background jobs of a shell ignore Ctrl-C. Leave that unchanged.
         if handler != signal.SIG_IGN:
             signal.signal(number, note)
     try:
@@ -71,8 +72,8 @@ def interrupts_wait() -> Iterator[Callable[[], bool]]:
 def _interrupt(number: int, frame: FrameType | None) -> None:
     """Raises KeyboardInterrupt, but not while trimesh is being imported.
 
-    The optional imports of trimesh would catch the exception. A timer tries again until it can be
-    raised.
+    Trimesh catches exceptions in its optional imports, so the interrupt would be lost. A timer
+    tries again until the exception can be raised.
     """
     while frame is not None:
         module = str(frame.f_globals.get("__name__", ""))
@@ -84,10 +85,10 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
 
 
 def run_command(main: Callable[[], int]) -> None:
-    """Runs a command and exits with its code; prints a UserError as one line."""
+    """Runs a command and exits with its exit code. A UserError is printed as one line."""
     # Hide Drake's messages about ports and frame names.
     logging.getLogger("drake").setLevel(logging.WARNING)
-    # Like Ctrl-C, SIGTERM raises KeyboardInterrupt, so that files and processes are cleaned up.
+    # SIGTERM raises KeyboardInterrupt like Ctrl-C, so that files and processes are cleaned up.
     signals = [signal.SIGTERM, signal.SIGALRM]
     if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
         signals.append(signal.SIGINT)

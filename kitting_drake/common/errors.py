@@ -1,15 +1,16 @@
 """Errors that a user can fix."""
 
 DIVERGED = "a loss is no longer a number"
-"""Message of the error that ends a diverged training."""
+"""Message of the error that ends a training run that has diverged."""
 
 
 class UserError(ValueError):
-    """Invalid input. The message is one sentence: what is wrong, where, and what to do.
+    """Invalid input. The message is one sentence that says what is wrong, where, and what to do.
 
     Commands print it and exit with code 2.
     """
 
 
 class MachineError(UserError):
-    """This machine lacks something, e.g. a library or disk space. The input may work elsewhere."""
+    """This machine lacks something, for example a library or disk space. The input may work on
+    another machine."""

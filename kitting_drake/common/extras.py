@@ -1,4 +1,4 @@
-"""Optional packages, which are extras of the project."""
+"""Imports optional packages, which are extras of the project."""
 
 import importlib
 from types import ModuleType
@@ -27,13 +27,14 @@ def import_extra(package: str, *modules: str, purpose: str, extra: str) -> Modul
     """Imports a package that may be missing.
 
     Args:
-        package: its name.
-        modules: submodules to import with it.
-        purpose: the command or option that needs it, for the error message.
-        extra: the project's extra that contains it.
+        package: name of the package.
+        modules: submodules of the package to import as well.
+        purpose: the command or option that needs the package, for the error message.
+        extra: the project's extra that contains the package.
 
     Raises:
-        MachineError: it is not installed; the message has the command that installs it.
+        MachineError: the package is not installed. The message contains the command that installs
+            it.
     """
     try:
         found = importlib.import_module(package)

@@ -1,4 +1,4 @@
-"""Atomic files, and output folders that belong to one run and one process."""
+"""Writes files atomically, and reserves output folders for one run and one process."""
 
 import contextlib
 import fcntl
@@ -41,7 +41,7 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def require_folder(path: Path) -> Path:
-    """Creates a folder for a run's output, and checks before the run that it is writable.
+    """Creates a folder for the output of a run, and checks that it is writable.
 
     Raises:
         MachineError: creating or writing fails.
@@ -55,7 +55,8 @@ def require_folder(path: Path) -> Path:
 
 
 def replace_folder(folder: Path, made: Path, aside: Path) -> None:
-    """Moves `made` to `folder`, and the previous `folder` to `aside`. If it fails, neither moves.
+    """Moves the existing `folder` to `aside`, and then `made` to `folder`. On failure both are
+    where they were.
 
     Raises:
         OSError: moving fails.
@@ -75,7 +76,8 @@ def files_digest(paths: Iterable[Path]) -> str:
     """A digest of the files' contents, in order."""
     digest = hashlib.sha256()
     for path in paths:
-        # Hash each file by itself, so that moving bytes from one to the next changes the result.
+        # Hash each file separately, so that the digest depends on where one file ends and the next
+        # begins.
         digest.update(hashlib.sha256(path.read_bytes()).digest())
     return f"sha256 {digest.hexdigest()}"
 
@@ -87,7 +89,7 @@ def claim_folder(folder: Path, name: str, described: Any, *, of: str) -> None:
         folder: the folder.
         name: the name of the JSON file.
         described: the run's description, serializable as JSON.
-        of: what a run is called in error messages.
+        of: the word for such a run in error messages.
 
     Raises:
         UserError: the folder contains other files, or those of a different run.
@@ -107,7 +109,8 @@ def claim_folder(folder: Path, name: str, described: Any, *, of: str) -> None:
             raise UserError(
                 f"{path} is damaged: give another --output, or delete {folder}"
             ) from error
-        # The order of tools or paints also counts.
+        # The comparison includes the order of mappings, because the order of tools or paints
+        # matters.
         if json.dumps(found) != json.dumps(described):
             raise UserError(
                 f"{folder} holds the files of another {of}"
@@ -117,7 +120,7 @@ def claim_folder(folder: Path, name: str, described: Any, *, of: str) -> None:
 
 
 def _first_difference(found: Any, described: Any) -> str:
-    """The first difference of two descriptions as text; empty if it would be long."""
+    """Describes the first difference of two descriptions; empty if the text would be long."""
     if not isinstance(found, dict) or not isinstance(described, dict):
         return ""
     for key in (*described, *found):
@@ -155,7 +158,8 @@ def alone_in(folder: Path) -> Iterator[None]:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             raise UserError(
-                f"another process is at work in {folder}: wait for it, or give another --output"
+                f"another process is writing to {folder}: "
+                "wait until it ends, or give another --output"
             ) from error
         except OSError as error:
             raise UserError(f"{folder} cannot be locked: {error.strerror}") from error
@@ -166,7 +170,7 @@ def append_line(path: Path, item: Any) -> None:
     """Appends an object to a JSON Lines file and syncs it to disk.
 
     Raises:
-        MachineError: writing fails; `read_lines` removes a partial line.
+        MachineError: writing fails. A partial line may remain, which `read_lines` removes.
     """
     try:
         with path.open("a") as file:
@@ -178,7 +182,7 @@ def append_line(path: Path, item: Any) -> None:
 
 
 def read_lines(path: Path) -> list[Any]:
-    """The objects of a JSON Lines file; empty if the file does not exist.
+    """Reads the objects of a JSON Lines file; empty if the file does not exist.
 
     An incomplete last line, left by a killed process, is removed from the file.
 

@@ -1,5 +1,5 @@
-"""Imports the user's modules that a scenario names: from Python's path, or from the folder of the
-scenario's YAML file."""
+"""Imports the user's modules that a scenario names. They are found on Python's path or in the
+folder of the scenario's YAML file."""
 
 import contextlib
 import importlib
@@ -14,9 +14,9 @@ from kitting_drake.common.provenance import source_digest
 
 @contextlib.contextmanager
 def modules_beside(base: Path) -> Iterator[None]:
-    """Appends a folder to Python's module path.
+    """Appends a folder to Python's module path for the duration of a `with` block.
 
-    As usual in Python, the first imported module of a name stays.
+    As usual in Python, a module that was imported before under the same name is used again.
 
     Args:
         base: the folder of the scenario's file.
@@ -35,10 +35,10 @@ def modules_beside(base: Path) -> Iterator[None]:
 
 
 def import_own(reference: str, base: Path) -> Any:
-    """Imports `module:name`.
+    """Imports an object that is given as `module:name`.
 
     Args:
-        reference: the module and a name in it.
+        reference: the module and the name of the object in it, as `module:name`.
         base: the folder of the scenario's file.
 
     Raises:
@@ -50,10 +50,11 @@ def import_own(reference: str, base: Path) -> Any:
 
 
 def own_digest(module: str, base: Path) -> str:
-    """A digest of the sources of a module's package, or of the module if it is in no package.
+    """A digest of the sources of a module's package, or of the module itself if it belongs to no
+    package.
 
     Args:
-        module: its name.
+        module: name of the module.
         base: the folder of the scenario's file.
 
     Raises:
@@ -65,18 +66,18 @@ def own_digest(module: str, base: Path) -> str:
         spec = importlib.util.find_spec(module)
         if spec is None or not spec.has_location:
             raise LookupError(f"there is no file of the module {module}")
-        # The module may import the rest of its package.
+        # The module may import other modules of its package, so include the whole package.
         package = module.partition(".")[0]
         top = importlib.util.find_spec(package)
         return source_digest(package if top is not None and top.has_location else module)
 
 
 def files_beside(module: str, base: Path) -> list[Path]:
-    """The files of a module, or of its package, in the folder of the scenario's file; empty if it
-    is elsewhere.
+    """The files of a module, or of its package, if it is in the folder of the scenario's file; else
+    an empty list.
 
     Args:
-        module: its name.
+        module: name of the module.
         base: the folder of the scenario's file.
     """
     top = base / module.partition(".")[0]

@@ -6,18 +6,20 @@ from pathlib import Path
 
 def _data_root() -> Path:
     package = Path(__file__).resolve().parent.parent
-    # A wheel contains models/ and scenarios/ in the package; a checkout has them beside it.
+    # In a wheel, models/ and scenarios/ are inside the package; in a checkout they are beside it.
     return package if (package / "models").is_dir() else package.parent
 
 
 MODELS = _data_root() / "models"
-"""Models of hand, table and tools; also the folder of the ROS package `kitting_models`."""
+"""The folder of the models of robots, table and tools. It is also the ROS package
+`kitting_models`."""
 
 GENERALIST = MODELS / "policies" / "generalist.safetensors"
-"""Weights of the policy for arbitrary tools, trained on static scenes."""
+"""The file with the weights of the policy for arbitrary tools, which was trained on static
+scenes."""
 
 SCENARIOS = _data_root() / "scenarios"
-"""The project's scenarios."""
+"""The folder of the project's scenarios."""
 
 
 def cache_directory() -> Path:

@@ -1,4 +1,4 @@
-"""Runs functions in fresh processes, in parallel, so that a crash affects no other."""
+"""Runs functions in parallel in separate processes, so that a crash affects only one of them."""
 
 import contextlib
 import multiprocessing
@@ -29,7 +29,7 @@ _MOST_CALLS = 10
 _PATIENCE = 3.0
 """Time for a stopped process to remove partial files, in s."""
 _MOST_AT_WORK = 1000
-"""Limit on parallel calls. Each occupies a thread of this process."""
+"""Largest number of parallel calls. Each of them occupies a thread of this process."""
 
 
 @dataclass(frozen=True)
@@ -37,17 +37,17 @@ class ProcessCrashed:
     """A process that ended without a result."""
 
     exit_code: int | None
-    """Negative: the signal that killed the process."""
+    """Exit code of the process. A negative number is that of the signal that killed it."""
 
     @property
     def was_killed(self) -> bool:
-        """Whether it was killed from outside, e.g. for lack of memory."""
+        """Whether the process was killed from outside, for example for lack of memory."""
         return self.exit_code in (-signal.SIGKILL, -signal.SIGTERM)
 
     def killed_twice(self, seed: int) -> UserError:
         """The error to raise if the retry was also killed."""
         return UserError(
-            f"the process of seed {seed} was killed twice, perhaps for want of memory: run the "
+            f"the process of seed {seed} was killed twice, perhaps for lack of memory: run the "
             "command again with fewer --workers, or fewer CPUs per node, to resume"
         )
 
@@ -62,7 +62,8 @@ class Subprocess:
         context = multiprocessing.get_context("spawn")
         self._connection, theirs = context.Pipe()
         self._process = context.Process(target=_serve, args=(theirs,), daemon=True)
-        # The process inherits the mask, which blocks Ctrl-C even while it starts.
+        # Block Ctrl-C in the signal mask. The new process inherits the mask, so it ignores Ctrl-C
+        # from the beginning.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
             self._process.start()
@@ -78,8 +79,8 @@ class Subprocess:
         """Calls a function in the process and waits for it.
 
         Args:
-            function: importable by name; arguments and result must be picklable. Exceptions end the
-                process, except for `MachineError`.
+            function: a function that can be imported by name. Its arguments and its result must be
+                picklable. Exceptions other than `MachineError` end the process.
             arguments: the arguments of the function.
 
         Returns:
@@ -93,7 +94,7 @@ class Subprocess:
             self._connection.send((function, arguments))
             answer = self._connection.recv()
         except (EOFError, OSError):
-            # OSError: the process died while sending its result.
+            # The process ended; an OSError means that it died while sending its result.
             self._process.join()
             return ProcessCrashed(self._process.exitcode)
         if isinstance(answer, MachineError):
@@ -118,18 +119,20 @@ def run_in_subprocess(
 
 
 class Workers(Protocol):
-    """Runs functions in other processes, on this machine or on a cluster."""
+    """The interface of workers, which run functions in other processes, on this machine or on a
+    cluster."""
 
     def capacity(self) -> int:
         """The number of calls that can run at present; at least 1."""
 
     def run(self, function: Callable[..., _Result], *arguments: object) -> _Result | ProcessCrashed:
-        """Calls a function like `Subprocess.call`. Thread-safe.
+        """Calls a function like `Subprocess.call`. This method is thread-safe.
 
         Processes may be reused, so the function must not depend on earlier calls.
 
         Raises:
-            UserError: a worker lacks something, or the function raised a `MachineError`.
+            UserError: a worker cannot run the function, for example because a package is missing,
+                or the function raised a `MachineError`.
         """
 
     def stop(self) -> None:
@@ -142,15 +145,15 @@ class Workers(Protocol):
 class LocalWorkers:
     """This machine, as `Workers`. Use it in a `with` statement.
 
-    If there are several processes, each uses one thread. Processes are reused, because starting
-    one and importing everything takes seconds.
+    If there are several processes, each uses one thread. Processes are reused, because the start of
+    a process and its imports take seconds.
     """
 
     def __init__(self, count: int, *, reuse: bool = True) -> None:
         """
         Args:
             count: number of parallel processes.
-            reuse: whether a process executes several calls; else each call gets a fresh one.
+            reuse: whether a process executes several calls. If not, each call gets a new process.
         """
         self._count = count
         self._reuse = reuse
@@ -164,7 +167,7 @@ class LocalWorkers:
             self._most_calls = _MOST_CALLS
         self._threads_before = os.environ.get(_THREADS)
         if self._count > 1:
-            # Affects only the processes started from here.
+            # This affects only processes that are started later.
             os.environ[_THREADS] = "1"
         return self
 
@@ -214,19 +217,19 @@ def side_by_side(
 ) -> Iterator[_Result]:
     """Calls a function for each item, in threads; yields results as they complete.
 
-    If the iteration ends early, e.g. by Ctrl-C, the workers are stopped.
+    If the iteration ends early, for example by Ctrl-C, the workers are stopped.
 
     Args:
-        function: called in a thread; it delegates the work to `workers`.
-        draw: returns the next item, called in the caller's thread. None: there is none at present;
-            it is called again after the next result. The iteration ends if no call is running.
+        function: a function that is called in a thread and delegates the work to `workers`.
+        draw: returns the next item, in the caller's thread. If it returns None, it is called again
+            after the next result, and the iteration ends when no call is running.
         workers: determines the number of threads.
     """
     with ThreadPoolExecutor(_MOST_AT_WORK) as pool:
         working: set[Future[_Result]] = set()
         try:
             while True:
-                # A cluster's capacity may change.
+                # The capacity of a cluster may change, so ask for it each time.
                 most = min(workers.capacity(), _MOST_AT_WORK)
                 while len(working) < most and (item := draw()) is not None:
                     working.add(pool.submit(function, item))
@@ -241,7 +244,7 @@ def side_by_side(
 
 
 def counting_bar(console: Console, label: str) -> Progress:
-    """A progress bar with a count; invisible without a terminal."""
+    """A progress bar with a count. It is invisible if the output is not a terminal."""
     return Progress(
         TextColumn(label),
         BarColumn(),
@@ -262,7 +265,7 @@ def _serve(connection: Connection) -> None:
         terminated = True
         raise KeyboardInterrupt
 
-    # Unwind the stack, so that partial files are removed.
+    # Raise an exception, so that partial files are removed.
     signal.signal(signal.SIGTERM, terminate)
     with contextlib.suppress(EOFError, KeyboardInterrupt):
         while not terminated:
@@ -273,7 +276,7 @@ def _serve(connection: Connection) -> None:
                 answer = error
             connection.send(answer)
     if terminated:
-        # The exit code must show the signal.
+        # End by the signal itself, so that the exit code shows it.
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
         os.kill(os.getpid(), signal.SIGTERM)
 

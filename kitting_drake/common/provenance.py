@@ -1,4 +1,4 @@
-"""Versions and commit of the code that made a result."""
+"""Finds the versions and the commit of the code that makes a result."""
 
 import contextlib
 import hashlib
@@ -14,7 +14,8 @@ import numpy as np
 import kitting_drake
 
 COMMIT_VARIABLE = "KITTING_DRAKE_COMMIT"
-"""Environment variable with the commit of copied sources, which have no history."""
+"""Environment variable with the commit of sources that were copied to a cluster without their
+history."""
 
 
 _UNCOMMITTED = "+"
@@ -22,7 +23,8 @@ _UNCOMMITTED = "+"
 
 
 def versions() -> dict[str, str]:
-    """The versions of this package and its main dependencies; Drake's only if it is installed."""
+    """The versions of this package and its main dependencies. Drake's is included if it is
+    installed."""
     found = {"kitting_drake": kitting_drake.__version__}
     with contextlib.suppress(importlib.metadata.PackageNotFoundError):
         found["drake"] = importlib.metadata.version("drake")
@@ -30,9 +32,9 @@ def versions() -> dict[str, str]:
 
 
 def commit() -> str | None:
-    """The checkout's commit, with suffix `+` if tracked files have changed.
+    """The checkout's commit, with the suffix `+` if tracked files have changed.
 
-    On a cluster's node, the value of `COMMIT_VARIABLE`. None for an installed package.
+    On a cluster's node it is the value of `COMMIT_VARIABLE`. For an installed package it is None.
     """
     if given := os.environ.get(COMMIT_VARIABLE):
         return given
@@ -48,7 +50,7 @@ def commit() -> str | None:
 
 
 def is_reproducible(commits: str | None) -> bool:
-    """Whether the code can be checked out again.
+    """Whether all code that made a result can be checked out again.
 
     Args:
         commits: a result of `commit`, or several separated by commas. None or an empty text means

@@ -29,7 +29,8 @@ from kitting_drake.common.errors import MachineError
 from kitting_drake.common.files import write_atomically
 
 _rendering_process: int | None = None
-"""The process that made engines; a forked child inherits the value."""
+"""Id of the process that has made render engines. A forked child inherits the value and so detects
+the fork."""
 
 
 def can_render() -> bool:
@@ -42,7 +43,7 @@ def can_render() -> bool:
 
 
 def require_rendering() -> None:
-    """Checks that this process can render. Call it before making an engine.
+    """Checks that this process can render. Call this function before making an engine.
 
     Raises:
         MachineError: the system library is missing, or the process was forked from one that has
@@ -66,27 +67,27 @@ def require_rendering() -> None:
 def _load_triton() -> None:
     """Loads Triton before Mesa, if PyTorch is built for CUDA.
 
-    Each brings its own LLVM. PyTorch imports Triton with the first optimizer, and crashes if Mesa's
-    LLVM (for software rendering) is loaded already. The reverse order works.
+    Triton and Mesa each contain their own LLVM. PyTorch imports Triton with the first optimizer,
+    and crashes if Mesa's LLVM (for software rendering) is loaded already. The reverse order works.
     """
     with contextlib.suppress(OSError):
         if b"libLLVM" in Path("/proc/self/maps").read_bytes():
-            # Another renderer has loaded Mesa's LLVM already: loading Triton would crash.
+            # Another renderer has already loaded Mesa's LLVM, so loading Triton would crash.
             return
     package = importlib.util.find_spec("triton")
     for folder in (package and package.submodule_search_locations) or ():
         for library in Path(folder, "_C").glob("libtriton*.so"):
-            # If loading fails, PyTorch cannot import it either.
+            # If loading fails, PyTorch cannot import Triton either, so the error does not matter.
             with contextlib.suppress(OSError):
                 ctypes.CDLL(str(library))
 
 
 def add_observation_renderer(scene_graph: SceneGraph, lights: Sequence[LightParameter] = ()) -> str:
-    """Adds the plain and fast engine of the policy's cameras; returns its name.
+    """Adds the engine of the policy's cameras, which is plain and fast. Returns its name.
 
     Args:
-        scene_graph: gets the engine.
-        lights: if empty, a light at each camera.
+        scene_graph: the scene graph to which the engine is added.
+        lights: the lights; if empty, there is a light at each camera.
 
     Raises:
         MachineError: this machine cannot render.
@@ -98,10 +99,11 @@ def add_observation_renderer(scene_graph: SceneGraph, lights: Sequence[LightPara
 
 
 def add_picture_renderer(scene_graph: SceneGraph) -> str:
-    """Adds the engine for still pictures, with soft light from three sides and ambient occlusion;
-    returns its name.
+    """Adds the engine for still pictures, with soft light from three sides and ambient occlusion.
+    Returns its name.
 
-    Add it before a context is made: engines added later do not receive poses.
+    Call this function before a context is made, because engines that are added later do not receive
+    poses.
 
     Raises:
         MachineError: this machine cannot render.
@@ -110,7 +112,7 @@ def add_picture_renderer(scene_graph: SceneGraph) -> str:
 
 
 def add_film_renderer(scene_graph: SceneGraph) -> str:
-    """Adds the fast engine for videos, lit like pictures; returns its name.
+    """Adds the engine for videos, which is fast and lit like still pictures. Returns its name.
 
     Raises:
         MachineError: this machine cannot render.
@@ -142,7 +144,7 @@ def _light(direction: list[float], intensity: float) -> LightParameter:
 def look_at(position: Sequence[float], target: Sequence[float]) -> RigidTransform:
     """X_WC of an upright camera at `position` that looks at `target`, both in the world in metres.
 
-    Camera axes: x right in the image, y down, z forward. The view must not be vertical.
+    The camera's x axis points right in the image, y down, z forward. The view must not be vertical.
     """
     z = np.subtract(target, position)
     x = np.cross(z, [0.0, 0.0, 1.0])
@@ -151,14 +153,16 @@ def look_at(position: Sequence[float], target: Sequence[float]) -> RigidTransfor
 
 
 X_WOVERVIEW = look_at([1.62, -0.95, 1.13], [0.48, -0.02, 0.06])
-"""Camera pose for pictures and videos of the whole cell; `X_WARM_OVERVIEW` with an arm."""
+"""Camera pose for pictures and videos of the whole cell with a floating hand. `X_WARM_OVERVIEW` is
+that for an arm."""
 X_WARM_OVERVIEW = look_at([2.05, -1.35, 1.25], [0.36, 0.0, 0.34])
 
 
 def picture_camera(
     renderer: str, *, width: int = 1280, height: int = 800, fov_y: float = 0.42
 ) -> RenderCameraCore:
-    """A camera for pictures; size in pixels, vertical field of view in radians."""
+    """A camera for pictures. Width and height are in pixels, the vertical field of view `fov_y` in
+    radians."""
     return RenderCameraCore(
         renderer,
         CameraInfo(width=width, height=height, fov_y=fov_y),
@@ -170,7 +174,7 @@ def picture_camera(
 def render_picture(
     scene_graph: SceneGraph, context: Context, X_WC: RigidTransform
 ) -> NDArray[np.uint8]:
-    """(800, 1280, 3) picture of a scene graph in its context, from a camera pose.
+    """Renders a picture (800, 1280, 3) of a scene graph in its context, from a camera pose.
 
     The scene graph needs the engine of `add_picture_renderer`.
     """
@@ -181,7 +185,7 @@ def render_picture(
 
 
 def png_bytes(pixels: NDArray[np.uint8]) -> bytes:
-    """An image (height, width, 3) as a PNG."""
+    """Encodes an image (height, width, 3) as PNG."""
     buffer = io.BytesIO()
     Image.fromarray(pixels).save(buffer, "PNG")
     return buffer.getvalue()

@@ -1,4 +1,4 @@
-"""Reads models as text, and varies their friction and mass."""
+"""Reads models as SDFormat text, and scales their friction and mass."""
 
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
@@ -9,9 +9,9 @@ _DRAKE = "http://drake.mit.edu"
 
 
 def model_text(path: Path, *, friction: float = 1.0, mass: float = 1.0) -> str | None:
-    """The SDFormat text of a model, with friction coefficients and inertia scaled.
+    """Reads the SDFormat text of a model, with scaled friction coefficients and inertia.
 
-    Drake loads a text ten times as fast as its file: for each file it reads SDFormat's schema
+    Drake loads a text ten times as fast as a file, because for each file it reads SDFormat's schema
     again, which takes 70 ms.
 
     Args:
@@ -33,7 +33,7 @@ def model_text(path: Path, *, friction: float = 1.0, mass: float = 1.0) -> str |
     try:
         text = path.read_text()
         if "xmlns:drake" not in text:
-            # Drake's parser does not need the declaration, but XML does.
+            # XML requires that the prefix `drake:` is declared, although Drake's parser does not.
             text = text.replace("<sdf ", f'<sdf xmlns:drake="{_DRAKE}" ', 1)
         root = ElementTree.fromstring(text)
         if is_varied:
@@ -46,7 +46,8 @@ def model_text(path: Path, *, friction: float = 1.0, mass: float = 1.0) -> str |
         return None
     for uri in root.iter("uri"):
         if uri.text and "://" not in uri.text:
-            # A text has no folder, so make URIs absolute. Drake decodes no escapes in them.
+            # A text has no folder, so make URIs absolute. Do not escape them, because Drake does
+            # not decode escapes.
             uri.text = f"file://{path.resolve().parent / uri.text}"
     return ElementTree.tostring(root, encoding="unicode")
 
@@ -61,7 +62,7 @@ def _vary(root: ElementTree.Element, friction: float, mass: float) -> None:
 
 
 def _refers_to_a_file(element: ElementTree.Element) -> bool:
-    """Whether an element names another model or a picture, whose path may be relative."""
+    """Whether an element refers to another model or to a picture, whose path may be relative."""
     return element.tag == "include" or element.tag.endswith("_map")
 
 

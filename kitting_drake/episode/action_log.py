@@ -1,6 +1,6 @@
-"""Records a policy's actions and their errors with respect to the expert's.
+"""Records a policy's actions, and how far they deviate from the expert's.
 
-It uses true poses, which policies cannot see.
+The records use true poses, which policies cannot see.
 """
 
 import dataclasses
@@ -18,7 +18,7 @@ from systems.placement import Goal, PlacedObject, displacement, heading
 from systems.signals import PlanarPose, wrap_to_pi
 
 _LIFTED = 0.010
-"""Least rise of an object that counts as lifted, in m."""
+"""An object that rises by at least this counts as lifted, in m."""
 
 
 def nearest_object(station: KittingStation, poses: list[RigidTransform], pick: PlanarPose) -> int:
@@ -37,7 +37,7 @@ def nearest_object(station: KittingStation, poses: list[RigidTransform], pick: P
 
 
 class ActionLog:
-    """Records the actions of an episode. Its `observe` is an `EpisodeObserver`."""
+    """Records the actions of an episode. Pass its method `observe` as an `EpisodeObserver`."""
 
     def __init__(self, station: KittingStation) -> None:
         """
@@ -105,7 +105,7 @@ class ActionLog:
             self.records[-1] = self._record(int(np.argmax(rises)), last.pick, last.place)
 
     def _record(self, index: int, pick: PlanarPose, place: PlanarPose) -> ActionRecord:
-        """A new record, with outcome "unfinished", of an action on the given object."""
+        """Makes a new record, with outcome "unfinished", of an action on the given object."""
         scene_object, item = self._station.scene.objects[index], self._station.objects[index]
         record = ActionRecord(
             object=scene_object.name,
@@ -122,7 +122,7 @@ class ActionLog:
         best = [gripper_pose(X_WB, grasp) for grasp in scene_object.grasps]
         if best:
             nearest = min(best, key=lambda pose: math.hypot(pick.x - pose.x, pick.y - pose.y))
-            # Of several grasps at the nearest point, take the one nearest in angle.
+            # Several grasps may be at the nearest point. Use the one whose angle is nearest.
             here = [p for p in best if math.hypot(p.x - nearest.x, p.y - nearest.y) < 1e-6]
             angle = min(abs(wrap_to_pi(2 * (pick.theta - p.theta))) / 2 for p in here)
             distance = math.hypot(pick.x - nearest.x, pick.y - nearest.y)
@@ -151,7 +151,8 @@ class ActionLog:
 def _place_errors(
     item: PlacedObject, goal: Goal, X_WGoal: RigidTransform, arrival: RigidTransform
 ) -> tuple[float, float, float]:
-    """Total displacement (m), distance of the middles (m) and angle (rad) of an object from a goal.
+    """Mean displacement (m), distance of the middles (m) and angle (rad) between an object's pose
+    and its goal.
 
     Only the planar arrival pose is known, so heights are not compared.
     """

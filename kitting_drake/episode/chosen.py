@@ -14,14 +14,15 @@ from kitting_drake.scenario.choosing import ChosenScenario
 from kitting_drake.station import KittingStation, build_station, with_policy
 
 _TRIED = 5
-"""Number of seeds to try before a scenario counts as invalid."""
+"""A scenario counts as invalid if no valid scene is found with this many seeds."""
 
 
 def build_chosen(chosen: ChosenScenario, *, seed: int) -> tuple[Diagram, KittingStation]:
     """Builds a Diagram of the chosen scenario's station and policy; returns it and the station.
 
     Raises:
-        UserError: as `build_station` and `make_policy`; the message names the scenario's file.
+        UserError: station or policy cannot be made (see `build_station` and `make_policy`). The
+            message names the scenario's file.
     """
     with chosen.named_in_errors():
         station = build_station(chosen.scenario, seed, chosen.base)
@@ -29,13 +30,13 @@ def build_chosen(chosen: ChosenScenario, *, seed: int) -> tuple[Diagram, Kitting
 
 
 def build_any_chosen(chosen: ChosenScenario, seeds: Iterable[int]) -> KittingStation:
-    """Builds the station with the first seed that gives a valid scene; tries a few.
+    """Builds the station with the first of a few seeds that gives a valid scene.
 
-    A random scene may be invalid for some seeds. That should fail only the episodes of these seeds.
+    A random scene may be invalid for some seeds. Then only the episodes of these seeds should fail.
 
     Raises:
-        MachineError: this machine cannot build it.
-        UserError: none of the seeds that were tried works; this is the error of the first one.
+        MachineError: this machine cannot build the station.
+        UserError: none of the seeds works. The error is that of the first seed.
     """
     errors = []
     for seed in itertools.islice(seeds, _TRIED):
@@ -58,8 +59,8 @@ def run_chosen(
     log: Path | None = None,
     sampler: Sampler | None = None,
 ) -> EpisodeResult:
-    """Calls `run_episode` with a Diagram fresh from `build_chosen`; writes a log if `log` names a
-    file. The sampler is called after every step."""
+    """Calls `run_episode` with a new Diagram from `build_chosen`. Writes a log to the file `log`,
+    if given, and calls `sampler` after every step."""
     episode_log = None if log is None else EpisodeLog(station)
     both = [item for item in (episode_log, sampler) if item is not None]
     result = run_episode(
@@ -77,7 +78,7 @@ def run_chosen(
 
 
 class _Samplers:
-    """Several samplers as one."""
+    """Combines several samplers into one."""
 
     def __init__(self, samplers: Sequence[Sampler]) -> None:
         self._samplers = samplers

@@ -28,17 +28,18 @@ from kitting_drake.policies.data.demonstrations import (
 )
 
 _MOST_REJECTED = 20
-"""After this many rejected seeds in a row, collecting fails."""
+"""If this many seeds in a row are rejected, the collection fails."""
 
 Demonstrate = Callable[[int], Demonstration | Rejection | ProcessCrashed]
-"""Makes the demonstration of a seed. Called in threads."""
+"""A function that makes the demonstration of a seed. It is called in threads."""
 
 
 class Collection:
     """A folder with the demonstrations of the first seeds that are not rejected.
 
-    The result is independent of the number of workers and of interruptions. Unfinished collections
-    keep a file per seed in `parts`; the end merges them into `demonstrations.h5`.
+    The result does not depend on the number of workers or on interruptions. An unfinished
+    collection keeps one file for each seed in `parts`. They are merged into `demonstrations.h5` at
+    the end.
     """
 
     def __init__(self, folder: Path, origin: Origin) -> None:
@@ -46,7 +47,7 @@ class Collection:
 
         Args:
             folder: the folder of the files.
-            origin: the origin of the demonstrations.
+            origin: the scenario and the versions that make the demonstrations.
 
         Raises:
             UserError: a file has another origin or is damaged.
@@ -59,7 +60,7 @@ class Collection:
         self.assembled = 0
         """The number of demonstrations in `demonstrations.h5`."""
         for path in self._parts.glob(".*"):
-            # Left by a killed process.
+            # This file is left over from a killed process.
             path.unlink()
         for path in self._parts.glob("seed_*"):
             try:
@@ -93,7 +94,7 @@ class Collection:
         self.assembled = len(contents.seeds)
         self._accepted |= dict.fromkeys(contents.seeds, self.path)
         self._rejected |= {item.seed: item for item in contents.rejected}
-        # A process killed after merging leaves its parts.
+        # A process that was killed after the merge has left its parts.
         self._remove_parts([*contents.seeds, *(item.seed for item in contents.rejected)])
 
     def collect(
@@ -101,11 +102,12 @@ class Collection:
     ) -> None:
         """Makes the missing demonstrations and merges all into `demonstrations.h5`.
 
-        If a process dies, its seed is tried once more, as a process may be killed from outside.
+        If a process dies, its seed is tried once more, because the process may have been killed
+        from outside.
 
         Args:
             count: the number of demonstrations wanted.
-            demonstrate: makes a demonstration; called in threads.
+            demonstrate: makes a demonstration; it is called in threads.
             workers: determine the number of parallel calls.
             console: where to show the progress bar.
 
@@ -191,19 +193,19 @@ def next_seed(
     rejected: Container[int],
     working: Container[int],
 ) -> int | None:
-    """The seed to try next.
+    """Chooses the seed to try next.
 
-    Demonstrations are wanted of the first `count` seeds that are not rejected.
+    The collection should hold demonstrations of the first `count` seeds that are not rejected.
 
     Args:
         seeds: the permitted seeds, in order.
         count: the number of demonstrations wanted.
-        accepted: seeds with a demonstration.
-        rejected: seeds without one.
+        accepted: seeds that have a demonstration.
+        rejected: seeds whose demonstration was rejected.
         working: seeds in progress.
 
     Returns:
-        The seed. None if there are already `count` seeds, accepted or in progress.
+        The seed; None if `count` seeds are already accepted or in progress.
 
     Raises:
         UserError: no seed is left, or too many seeds in a row were rejected.

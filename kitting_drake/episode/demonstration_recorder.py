@@ -13,7 +13,7 @@ from kitting_drake.station import KittingStation
 from systems.signals import Observation, PickPlaceAction
 
 LEAST_SCORE = 0.99
-"""Demonstrations with a lower success rate are rejected."""
+"""Episodes with a lower success rate are rejected as demonstrations."""
 
 
 class DemonstrationRecorder:
@@ -23,8 +23,9 @@ class DemonstrationRecorder:
         """
         Args:
             station: a station with cameras and the oracle.
-            later_picks_possible: see `Learning`. Episodes with two actions on one object are then
-                rejected: the first action moves the object, so its later pick is a wrong label.
+            later_picks_possible: see `Learning`. If set, episodes with two actions on one object
+                are rejected: the first action moves the object, so its later pick would be a wrong
+                label for earlier observations.
         """
         self._station = station
         self._later_picks_possible = later_picks_possible
@@ -32,7 +33,8 @@ class DemonstrationRecorder:
         self._final: FinalObservation | None = None
 
     def observe(self, event: ModeChange) -> None:
-        """Records observation and action when an action begins, and the observation at the stop."""
+        """Records observation and action when an action begins, and the observation when the expert
+        stops."""
         if event.is_last or not (event.is_action_start or event.is_stop):
             return
         observation = self._station.observation(event.root_context)
@@ -43,7 +45,8 @@ class DemonstrationRecorder:
             self._actions.append((observation, action))
 
     def demonstration(self, result: EpisodeResult) -> Demonstration | Rejection:
-        """The demonstration of a finished episode, without its failed actions, or a `Rejection`."""
+        """Makes the demonstration of a finished episode, without its failed actions, or a
+        `Rejection`."""
         if result.failure or result.success_rate < LEAST_SCORE:
             reason = result.failure or f"the reward was {result.success_rate:.0%}"
             return Rejection(result.seed, result.success_rate, reason)

@@ -1,6 +1,6 @@
-"""The objects left over at the end of an episode, and whether the reason for stopping is right.
+"""Finds the objects left over at the end of an episode, and judges the reason for stopping.
 
-It uses true poses, which policies cannot see.
+The judgement uses true poses, which policies cannot see.
 """
 
 import math
@@ -12,13 +12,13 @@ from kitting_drake.station import KittingStation
 from systems.placement import GONE
 
 _NOTHING_TO_DO = ("done", "nothing fits")
-"""The reasons that claim that nothing is left to do."""
+"""The reasons for stopping that claim that nothing is left to do."""
 _UNJUDGED = ("", "interrupted")
 
 
 @dataclass(frozen=True)
 class Position:
-    """A place on the table, in metres in the world."""
+    """A position on the table, in the world, in metres."""
 
     x: float
     y: float
@@ -26,19 +26,19 @@ class Position:
 
 @dataclass(frozen=True)
 class Remainder:
-    """The key `left_over` of `results.json`."""
+    """The objects and goals left over: the value of `left_over` in `results.json`."""
 
     objects: tuple[Position, ...] = ()
-    """The middles of the objects that are not placed."""
+    """Positions of the objects that are not placed."""
     cavities: tuple[Position, ...] = ()
-    """The middles of the goals that are not filled."""
+    """Positions of the goals that are not filled."""
     source: str = "state"
-    """`policy`: what the stopping policy reported. `state`: the objects that could fill a goal, and
-    the goals, in the true state."""
+    """The origin of the lists. `policy`: the policy reported them when it stopped. `state`: they
+    are the unfilled goals, and the objects that could fill a goal, in the true state."""
 
     @property
     def text(self) -> str:
-        """In words; empty if nothing is left over."""
+        """A description in words; empty if nothing is left over."""
         parts = [
             f"{len(points)} {name if len(points) == 1 else plural} at "
             + ", ".join(f"({point.x:.2f}, {point.y:.2f})" for point in points)
@@ -52,7 +52,8 @@ class Remainder:
 
 
 def find_left_over(station: KittingStation, root_context: Context) -> Remainder:
-    """The objects and goals left over: as the policy reported them, else of the true state."""
+    """Finds the objects and goals left over: those that the policy reported, or else those of the
+    true state."""
     action = station.accepted_action(root_context)
     if action.stop and action.left_over is not None:
         seen = action.left_over
@@ -75,7 +76,7 @@ def is_right(reason: str, station: KittingStation, root_context: Context) -> boo
     """Whether the reason for stopping is right, judged by the true state.
 
     Something is left to do if an unfilled goal accepts an object that lies in the cell and fills no
-    goal. Filled means success by the task's measure.
+    goal. Whether a goal is filled is decided by the task's measure of success.
 
     - `done`: right if nothing is left to do.
     - `nothing fits`: right if nothing is left to do, but an object or a goal is left.
@@ -83,12 +84,12 @@ def is_right(reason: str, station: KittingStation, root_context: Context) -> boo
       `failure`): right if something is left to do.
 
     Args:
-        reason: a `stop_reason`.
+        reason: a value of `stop_reason`.
         station: the station of the episode.
         root_context: the root context of the outermost Diagram, at the end.
 
     Returns:
-        None for `interrupted`, and before the end.
+        Whether it is right; None for `interrupted`, and before the end.
     """
     if reason in _UNJUDGED:
         return None
@@ -110,7 +111,7 @@ def _loose_and_free(station: KittingStation, root_context: Context) -> tuple[lis
         zip(placements, station.object_poses(root_context), strict=True)
     ):
         distance = math.hypot(*X_WB.translation())
-        # Also false for NaN.
+        # This form is also false for NaN.
         if not item.success and distance < GONE:
             loose.append(index)
     return loose, [index for index in range(len(station.scene.goals)) if index not in filled]

@@ -29,20 +29,22 @@ class ObjectResult:
     name: str
     category: str
     add_s_mm: float | None
-    """None, like the other errors, if no goal was left for the object."""
+    """ADD-S, in mm. This and the other errors are None if no goal was left for the object."""
     success: bool
-    """By the task's success predicate; in kitting the paper's, ADD-S below the threshold."""
+    """Whether the object fills its goal by the task's success predicate. In kitting it is the
+    paper's: ADD-S below a threshold."""
     strict_success: bool
-    """Success with the right height and heading: `systems.placement.Placement.strict_success`."""
+    """Whether the object fills its goal and also has the right height and heading; see
+    `systems.placement.Placement.strict_success`."""
     position_error_mm: float | None
     angle_error_deg: float | None
-    """Modulo the object's declared symmetry."""
+    """Heading error, modulo the object's declared symmetry, in degrees."""
     height_error_mm: float | None
     cause: str | None
     """Why the object failed, one of the task's `causes`; None for a success."""
     measures: dict[str, bool] = dataclasses.field(default_factory=dict)
-    """Whether it is a success by each of the scene's other `measures`, and by `strict`; empty for a
-    task without any."""
+    """Whether the object is a success by each of the scene's other `measures`, and by `strict`;
+    empty if the task has no other measures."""
 
 
 @dataclasses.dataclass
@@ -55,15 +57,15 @@ class EpisodeResult:
     objects: list[ObjectResult]
     """The objects that can fill a goal."""
     success_rate: float
-    """The task's reward, 0 to 1 (in kitting the share of kitted tools); 0 if the episode failed or
-    timed out."""
+    """The task's reward, from 0 to 1 (in kitting, the share of kitted tools); 0 if the episode
+    failed or timed out."""
     strict_success_rate: float
-    """The same, counting only strict successes."""
+    """The task's reward if only strict successes count, from 0 to 1."""
     actions: int
     missed_grasps: int
     dropped_objects: int
     stopped_actions: int
-    """Actions that a contact force beyond `planner.force_limit` ended."""
+    """Number of actions that ended because a contact force exceeded `planner.force_limit`."""
     actions_taken: list[ActionRecord]
     """The policy's actions and their outcomes."""
     sim_seconds: float
@@ -79,15 +81,16 @@ class EpisodeResult:
     interrupted: bool
     """Whether Ctrl-C ended the episode."""
     stop_reason: str
-    """Why no more actions followed: a word of `STOP_REASONS`, `time`, `failure` or `interrupted`;
+    """Why no more actions followed: a key of `STOP_REASONS`, `time`, `failure` or `interrupted`;
     empty before the end."""
     stop_reason_right: bool | None = None
-    """Whether the true state bears it out (see `ending.is_right`); None if it is not judged."""
+    """Whether the true state confirms the reason (see `ending.is_right`); None if it is not
+    judged."""
     left_over: Remainder = dataclasses.field(default_factory=Remainder)
     """Objects that are not placed and cavities that are not filled."""
 
     def as_dict(self) -> dict[str, Any]:
-        """As plain values for JSON."""
+        """Returns the result as plain values for JSON."""
         return dataclasses.asdict(self)
 
 
@@ -103,17 +106,19 @@ def run_episode(
 ) -> EpisodeResult:
     """Runs an episode until the planner is done and the objects rest, or until the time limit.
 
-    An error of the policy or the simulation (e.g. the contact solver does not converge) and Ctrl-C
-    end the episode, not the program. The result then has `failure` or `interrupted` set.
+    If the policy or the simulation raises an error (for example because the contact solver does not
+    converge), or at Ctrl-C, only the episode ends, not the program. The result then has `failure`
+    or `interrupted` set.
 
     Args:
         diagram: the outermost Diagram, with the station and a connected policy.
-        station: fresh from `build_station`; its scenario sets, e.g., the time limit.
-        scenario: its name, for the result.
-        policy: its name, for the result.
+        station: a new station from `build_station`. Its scenario sets the time limit, among other
+            things.
+        scenario: name of the scenario, for the result.
+        policy: name of the policy, for the result.
         realtime_rate: 1 for real time, 0 for as fast as possible.
-        observers: called with every event.
-        log: samples every step.
+        observers: functions that are called with every event.
+        log: if given, samples every step.
     """
     episode = Episode(
         diagram,
@@ -129,7 +134,7 @@ def run_episode(
 
 
 class Episode:
-    """`run_episode` in parts, for callers that choose each action."""
+    """An episode that can be run in parts, for callers that choose each action."""
 
     def __init__(
         self,
@@ -145,10 +150,10 @@ class Episode:
     ) -> None:
         """
         Args:
-            diagram: may be the station alone if the episode pauses.
+            diagram: the outermost Diagram; with `pauses` it may be the station alone.
             pauses: whether `advance` returns each time the planner needs an action.
 
-        The other arguments are those of `run_episode`.
+            The other arguments are those of `run_episode`.
         """
         self._station = station
         self._names = {"scenario": scenario, "policy": policy, "seed": station.seed}
@@ -199,8 +204,8 @@ class Episode:
             self._failure = " ".join(f"{type(reason).__name__}: {reason}".split())
             self.is_over = True
             if reason is not error or not isinstance(error, RuntimeError):
-                # The text of Drake's RuntimeErrors suffices. A policy's exception may be of any
-                # type, so its author needs the traceback.
+                # For Drake's RuntimeErrors the text suffices. A policy may raise any exception, so
+                # log the traceback for its author.
                 seed = self._names["seed"]
                 logging.getLogger(__name__).exception("the episode of seed %d failed", seed)
         self._wall_seconds += time.perf_counter() - start
@@ -208,7 +213,7 @@ class Episode:
             self._monitor.tell(self.context, is_last=True)
 
     def result(self) -> EpisodeResult:
-        """The result; before the end, a preliminary one."""
+        """The result of the episode; before the end it is preliminary."""
         station, context, records = self._station, self.context, self._log.records
         placements, scene = station.placements(context), station.scene
         counts = station.counts(context)
@@ -327,7 +332,7 @@ class _Monitor:
         self.done_since: float | None = None
 
     def step(self, root_context: Context) -> EventStatus:
-        """Called after every step."""
+        """Checks the state after a step."""
         station = self._station
         self.tell(root_context)
         if self._log is not None:

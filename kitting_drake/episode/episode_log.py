@@ -60,8 +60,8 @@ def log_of_many(path: Path | None, cluster: str | None) -> Path | None:
         cluster: the cluster of `--ray`, if given.
 
     Raises:
-        UserError: as `check_log`, or both options are given.
-        MachineError: as `check_log`.
+        UserError: the file cannot be used (see `check_log`), or both options are given.
+        MachineError: a required package is not installed.
     """
     if path is None:
         return None
@@ -72,7 +72,8 @@ def log_of_many(path: Path | None, cluster: str | None) -> Path | None:
 
 
 def log_of_seed(path: Path, seed: int) -> Path:
-    """The log file of one of many episodes: `runs/log.npz` becomes `runs/log_00000007.npz`."""
+    """The log file of one of many episodes. For seed 7, `runs/log.npz` becomes
+    `runs/log_00000007.npz`."""
     return path.with_name(f"{path.stem}_{seed:08d}{path.suffix}")
 
 
@@ -120,11 +121,11 @@ class EpisodeLog:
             if self._seen is not None:
                 self._heights.append(self._seen)
         if station.has_cameras and port("asks")[0]:
-            # The policy's observation; Drake's cache avoids a second rendering.
+            # This is the policy's observation: Drake's cache avoids a second rendering.
             self._seen = port("observation_heights").height.astype(np.float32)
 
     def arrays(self) -> Arrays:
-        """The log, with n samples and k actions; SI units, radians, world frame.
+        """Returns the log of n samples and k actions, in SI units, radians and the world frame.
 
         Returns:
             For each step:
@@ -134,18 +135,19 @@ class EpisodeLog:
               y, z and yaw of the floating hand, or the seven of an arm;
             - `hand_pose` (n, 4), x, y, z and yaw of the hand;
             - `finger_position`, `finger_force` (n, 2), the force of the actuators;
-            - `wrist_force` (n, 6), contact on x, y, z, about z, and on each finger;
+            - `wrist_force` (n, 6), contact forces along x, y, z, the moment about z, and the force
+              on each finger;
             - `commanded_position`, `commanded_velocity`, `commanded_acceleration` (n, j);
-            - `commanded_opening` (n, 2), value and rate;
+            - `commanded_opening` (n, 2), the opening between the pads and its rate;
             - `object_poses` (n, objects, 3, 4), X_WB.
 
             For each action:
 
             - `action_time` (k), its start;
-            - `pick`, `place` (k, 3), x, y, theta; `press` (k);
+            - `pick`, `place` (k, 3), x, y and theta; `press` (k), whether the action presses;
             - `observation_height` (k, rows, cols), the policy's o_t; missing without cameras.
 
-            Texts: `joint_names`, `mode_names`, `object_names`.
+            Names: `joint_names`, `mode_names`, `object_names`.
         """
         found = {key: np.array(values) for key, values in self._samples.items()}
         names = joint_names(self._station.scenario.robot)

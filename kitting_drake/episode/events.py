@@ -14,8 +14,8 @@ class ModeChange:
     """The planner changed its mode or, as the last event, the episode ended.
 
     Observers are called one time step after the change. The bodies have not moved since the
-    planner's update. But ports that depend on time, such as those with camera noise, are evaluated
-    anew.
+    planner's update, but ports that depend on time, such as those with camera noise, have new
+    values.
     """
 
     previous: Mode
@@ -32,16 +32,17 @@ class ModeChange:
 
     @property
     def is_stop(self) -> bool:
-        """Whether the planner is done: the policy returned `stop`, or no actions are left."""
+        """Whether the planner has stopped, because the policy returned `stop` or no actions are
+        left."""
         return self.previous == Mode.OBSERVE and self.mode == Mode.DONE
 
 
 EpisodeObserver = Callable[[ModeChange], None]
-"""Called with every event, in order."""
+"""A function that is called with every event, in order."""
 
 
 class Sampler(Protocol):
-    """Called after every step, in order."""
+    """An object whose `sample` is called after every step, in order."""
 
     def sample(self, root_context: Context) -> None:
-        """Reads what it needs from the context of the outermost Diagram, and does not change it."""
+        """Reads values from the context of the outermost Diagram, without changing it."""

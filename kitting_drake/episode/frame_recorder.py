@@ -13,7 +13,7 @@ from systems.placement import ALL
 
 
 class FrameRecorder:
-    """Samples a station, as a `Sampler` of `run_episode`.
+    """A `Sampler` of `run_episode` that takes frames from a station.
 
     A frame is taken at the step nearest to each multiple of the period.
     """
@@ -48,7 +48,7 @@ class FrameRecorder:
             pictures.append(encode_png(images[image_key(camera)]))
 
     def frames(self) -> EpisodeFrames:
-        """All frames so far. The last one's action is the command that then holds."""
+        """All frames so far. The action of the last one is the present command."""
         commands = np.array(self._commands)
         rewards = np.array([*self._rewards, self._rewards[-1]])
         return EpisodeFrames(

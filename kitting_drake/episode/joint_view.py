@@ -1,4 +1,5 @@
-"""A station as learners of joint motions see it: camera images, state, and joint targets."""
+"""Reads camera images, joint positions and joint targets off a station, for policies that command
+joints."""
 
 from __future__ import annotations
 
@@ -16,7 +17,8 @@ from systems.trajectory_controller import FINGERS
 
 
 def chosen_cameras(recording: FrameSettings, cameras: dict[str, Any]) -> tuple[str, ...]:
-    """The names of the recorded cameras: all those of a scenario if the recording names none.
+    """The names of the recorded cameras. If the recording names none, they are all cameras of the
+    scenario.
 
     Raises:
         UserError: a name is unknown.
@@ -33,7 +35,7 @@ class JointView:
     def __init__(self, station: KittingStation, recording: FrameSettings) -> None:
         """
         Args:
-            station: with the cameras.
+            station: the station, with cameras.
             recording: chooses cameras and image size.
 
         Raises:
@@ -53,17 +55,18 @@ class JointView:
         return np.array([*state[:j], sum(state[j : j + FINGERS])], np.float32)
 
     def command(self, root_context: Context) -> NDArray[np.float32]:
-        """(entries) the planner's present targets. The opening includes the closing force: the
-        fingers' springs pull as hard towards it as towards the planner's opening with that
-        force."""
+        """(entries) the planner's present targets, in rad and m. The closing force is included in
+        the opening: towards this opening, the fingers' springs pull as hard as towards the
+        planner's opening with the closing force."""
         joints = self._port(root_context, "commanded")[: self._joints]
         opening = self._port(root_context, "commanded_opening")[0]
         force = self._port(root_context, "commanded_closing_force")[0]
-        # See `FingerLaw`: a force f closes as an opening that is 2 f / k_w smaller.
+        # See `FingerLaw`: a closing force f acts like an opening that is smaller by 2 f / k_w.
         return np.array([*joints, opening - 2 * force / self._stiffness], np.float32)
 
     def images(self, root_context: Context) -> dict[str, NDArray[np.uint8]]:
-        """By `image_key`, (height, width, 3): what the cameras see, with the scenario's noise."""
+        """The cameras' images (height, width, 3), with the scenario's noise, by their
+        `image_key`."""
         found = {}
         for camera in self.cameras:
             image = self._port(root_context, f"color_image_{camera}").data[:, :, :3]

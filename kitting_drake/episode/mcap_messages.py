@@ -29,7 +29,7 @@ _PARTS = {
         "std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/Transform transform"
     ),
 }
-"""Definitions of the message types used by others."""
+"""Definitions of the message types that are parts of other types."""
 
 _DEFINITIONS = {
     "sensor_msgs/msg/JointState": (
@@ -53,9 +53,9 @@ class Message:
 
     topic: str
     kind: str
-    """A key of `_DEFINITIONS`."""
+    """The message's type, a key of `_DEFINITIONS`."""
     time: float
-    """In seconds."""
+    """Time of the message in the episode, in s."""
     content: dict[str, Any]
 
 
@@ -77,7 +77,8 @@ def definition(kind: str) -> str:
 def mcap_messages(arrays: Mapping[str, NDArray[Any]]) -> Iterator[Message]:
     """The messages of a log, ordered by time.
 
-    - `/joint_states`, `/joint_commands`: `JointState` of x, y, z, yaw. `/gripper`: of the fingers.
+    - `/joint_states`, `/joint_commands`: `JointState` of the robot's joints. `/gripper`:
+      `JointState` of the fingers.
     - `/wrist_wrench`: `WrenchStamped`, the contact forces on the hand.
     - `/mode`: `String`, the planner's mode when it changes.
     - `/tf`: `TFMessage`, hand and objects in the frame `world`, 32 times a second.

@@ -20,7 +20,7 @@ _COLUMNS = 5
 _MARK = {"markeredgecolor": "white", "markeredgewidth": 1.2, "markersize": 10}
 _PICK = {"color": "#e69f00", "marker": "o", **_MARK}
 _PLACE = {"color": "#009e73", "marker": "s", **_MARK}
-"""Colours for the colour-blind too."""
+"""The style of the mark. Its colour can be distinguished by colour-blind people."""
 
 
 @dataclass(frozen=True)
@@ -28,15 +28,16 @@ class StripFrame:
     """One observation and the action that follows it."""
 
     colours: NDArray[np.float32]
-    """(rows, cols, 3), in [0, 1]."""
+    """(rows, cols, 3) picture of the observation, in [0, 1]."""
     pick: NDArray[np.float64] | None
-    """(row, col); None if no action follows."""
+    """(row, col) of the action's pick; None if no action follows."""
     place: NDArray[np.float64] | None
-    """(row, col); None if no action follows."""
+    """(row, col) of the action's place; None if no action follows."""
 
 
 class ActionStrip:
-    """Records o_t before each action and at the end. Its `observe` is an `EpisodeObserver`."""
+    """Records the observation o_t before each action and at the end. Pass its method `observe` as
+    an `EpisodeObserver`."""
 
     def __init__(self, station: KittingStation) -> None:
         """
@@ -47,7 +48,7 @@ class ActionStrip:
         self.frames: list[StripFrame] = []
 
     def observe(self, event: ModeChange) -> None:
-        """Records a frame if the event needs one."""
+        """Records a frame when an action begins and when the episode ends."""
         if not (event.is_action_start or event.is_stop):
             return
         seen = self._station.observation(event.root_context)
@@ -65,13 +66,13 @@ def _pixel(observation: Observation, pose: PlanarPose) -> NDArray[np.float64]:
 
 
 def draw_strips(rows: Sequence[tuple[str, Sequence[StripFrame], Sequence[str]]]) -> bytes:
-    """Several strips, one below the other; a long one goes on in another line.
+    """Draws several strips, one below the other. A long strip continues on another line.
 
     Args:
         rows: the title of each strip, its frames and the outcome of each action.
 
     Returns:
-        A PNG.
+        The picture as PNG.
     """
     columns = min(_COLUMNS, max(len(frames) for _, frames, _ in rows))
     lines = [-(-min(len(frames), _MOST_FRAMES) // columns) for _, frames, _ in rows]

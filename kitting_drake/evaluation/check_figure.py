@@ -1,4 +1,4 @@
-"""A figure of the heights at which each camera sees the table."""
+"""Draws a figure of the heights at which each camera sees the table."""
 
 from __future__ import annotations
 
@@ -18,11 +18,12 @@ def draw_heights(heights: Mapping[str, NDArray[np.float32]], grid: PixelGrid) ->
     """Draws heights above the table, seen from above, for each camera and all together.
 
     Args:
-        heights: (rows, cols) in metres, by camera name, and '' for all; NaN where unseen.
-        grid: the pixels.
+        heights: (rows, cols) heights in metres, by the camera's name; the empty name stands for all
+            cameras together. Unseen pixels are NaN.
+        grid: the pixel grid of the heights.
 
     Returns:
-        A PNG.
+        The picture as PNG.
     """
     values = np.concatenate([item[np.isfinite(item)] for item in heights.values()])
     # Ignore objects on the table.
@@ -54,7 +55,7 @@ def draw_heights(heights: Mapping[str, NDArray[np.float32]], grid: PixelGrid) ->
 
 
 def _without_gaps(height: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Fills pixels between a camera's samples, which would look like holes."""
+    """Fills the pixels between a camera's samples, which would look like holes otherwise."""
     seen = np.isfinite(height)
     share = ndimage.uniform_filter(seen.astype(np.float32), 3)
     mean = ndimage.uniform_filter(np.where(seen, height, 0).astype(np.float32), 3)

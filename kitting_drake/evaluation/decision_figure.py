@@ -1,4 +1,4 @@
-"""A figure of a learned policy's decision: the observation and the maps behind the action."""
+"""Draws a learned policy's decision: the observation and the predicted maps."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ _JAWS = 0.04
 """Half the opening of the jaws in the drawing, in metres."""
 _PICK, _PLACE = "#e4572e", "#1b998b"
 _UNSEEN, _STRIPE = (0.80, 0.72, 0.86), (0.68, 0.57, 0.78)
-"""Stripes of pixels that a camera looks at but has no depth of."""
+"""Colours of the stripes that mark pixels in a camera's view without a measured depth."""
 _OUTSIDE = (0.90, 0.90, 0.90)
-"""Pixels that no camera looks at, or outside the region of interest."""
+"""Colour of pixels outside all cameras' views or outside the region of interest."""
 _STRIPES = 6
 """Width of a pair of stripes, in pixels."""
 _MOST_LETTERS = 150
-"""The most letters in a line of the title."""
+"""Largest number of characters in a line of the title."""
 
 
 def draw_decision(observation: Observation, decision: Decision, *, title: str = "") -> bytes:
@@ -38,7 +38,7 @@ def draw_decision(observation: Observation, decision: Decision, *, title: str = 
     If the policy stops, no gripper is drawn, and the maps are those of the rejected action.
 
     Args:
-        observation: the observation decided on.
+        observation: the observation on which the decision is based.
         decision: the decision of a learned policy.
         title: the title of the picture; empty for the kind of action.
 
@@ -65,7 +65,7 @@ def draw_action(observation: Observation, action: PickPlaceAction, *, title: str
     """Draws the observation with both gripper poses, for a decision without maps.
 
     Args:
-        observation: the observation decided on.
+        observation: the observation on which the decision is based.
         action: the decision.
         title: the title of the picture; empty for the kind of action.
 
@@ -84,10 +84,10 @@ def draw_action(observation: Observation, action: PickPlaceAction, *, title: str
 
 
 def draw_maps(observation: Observation, decision: Decision, *, width: int) -> bytes:
-    """The two maps alone, side by side, as a strip of a film.
+    """Draws only the two maps of pick and place, side by side, for a frame of a video.
 
     Args:
-        observation: the observation decided on.
+        observation: the observation on which the decision is based.
         decision: a learned policy's decision.
         width: the width of the picture, in pixels; its height follows from the maps.
 
@@ -157,7 +157,8 @@ def _draw_observation(colour: Axes, height: Axes, observation: Observation) -> N
 
 
 def _title(decision: Decision) -> str:
-    """The kind of action and its confidence; empty if the networks give no confidence."""
+    """A title with the kind of action and its log-odds; empty if the networks do not predict
+    log-odds."""
     said = "stop" if decision.stop else "pick and place"
     if decision.log_odds is None:
         return said if decision.stop else ""

@@ -10,7 +10,8 @@ from systems.pick_place_parameters import Mode
 
 
 class EpisodeProgress:
-    """A progress bar with a step for each action. Its `observe` is an `EpisodeObserver`."""
+    """A progress bar with a step for each action. Pass its method `observe` as an
+    `EpisodeObserver`."""
 
     def __init__(self, console: Console, station: KittingStation) -> None:
         self._station = station

@@ -1,4 +1,4 @@
-"""A figure of the proposed workspace and region, seen from above."""
+"""Draws the proposed workspace and region, seen from above."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ Corners = Sequence[tuple[float, float]]
 
 _REGION, _WORKSPACE, _IGNORED = "#f2a33a", "#2f6fde", "#d6336c"
 _HIGHEST = 0.08
-"""The top of the colour scale, in metres."""
+"""Height at the upper end of the colour scale, in metres."""
 _UNSEEN = 0.82
-"""Grey of what is not seen."""
+"""Grey value of unseen pixels."""
 
 
 def draw_found(
@@ -32,13 +32,13 @@ def draw_found(
     """Draws colour and height from above, with the outlines of workspace and region.
 
     Args:
-        observation: the heightmap of the table in view.
-        workspace: the proposed pixels of o_t.
-        region: corners (x, y) in the base frame, in metres.
-        ignore: polygons of the same kind.
+        observation: the heightmap of all of the table that the cameras see.
+        workspace: the proposed pixel grid of o_t.
+        region: corners (x, y) of the region of interest in the robot's base frame, in metres.
+        ignore: polygons, in the same frame, whose content is ignored.
 
     Returns:
-        A PNG.
+        The picture as PNG.
     """
     grid = observation.grid
     width = 12.0
@@ -74,7 +74,7 @@ def draw_found(
 def _outline(
     axes: Axes, grid: PixelGrid, workspace: PixelGrid, region: Corners, ignore: Sequence[Corners]
 ) -> None:
-    """Darkens what is outside the region, and draws all outlines and the robot's base."""
+    """Darkens pixels outside the region, and draws all outlines and the robot's base."""
     border = [
         (grid.y_min, grid.x_min),
         (grid.y_max, grid.x_min),
@@ -106,7 +106,7 @@ def _outline(
 
 
 def _area(corners: Corners) -> float:
-    """Twice the signed area of a polygon."""
+    """Twice the signed area of a polygon, in m^2."""
     x, y = np.array(corners).T
     return float((x * np.roll(y, -1) - y * np.roll(x, -1)).sum())
 

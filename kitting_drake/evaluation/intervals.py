@@ -1,4 +1,4 @@
-"""95 % confidence intervals of rates."""
+"""Computes 95 % confidence intervals of rates."""
 
 import math
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ _UPPER = 0.975
 """Quantile of the upper end of a two-sided 95 % interval."""
 _Z = NormalDist().inv_cdf(_UPPER)
 _ALIKE = 0.9
-"""If this share of the scores is equal, their sample variance is unreliable."""
+"""If at least this share of the scores is equal, their sample variance is unreliable."""
 
 
 def proportion_interval(successes: int, trials: int) -> list[float]:

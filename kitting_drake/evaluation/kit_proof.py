@@ -1,4 +1,4 @@
-"""Proves a kit before it is cut, in simulation, with the printer's tolerance drawn."""
+"""Tests a kit in simulation before it is made, with random errors of the printer."""
 
 import base64
 import html
@@ -19,11 +19,12 @@ from kitting_drake.evaluation.intervals import proportion_interval
 from kitting_drake.scenario.choosing import find_scenario
 
 TOLERANCE_MM = 0.1
-"""The standard deviation of a printed cavity's width, on each side."""
+"""The standard deviation of the error of a printed cavity's walls, in mm on each side."""
 GOOD = 0.95
-"""The share of tools that a kit which fits must reach."""
+"""A kit fits if at least this share of the tools is kitted."""
 _WIDER = (1.5, 2.25)
-"""Clearances that are tried for a kit that does not fit, as multiples of its own."""
+"""Clearances that are tried for a kit that does not fit, as multiples of the kit's own
+clearance."""
 _LEAST_WIDER_MM = 0.2
 _FILES = ("proof.html", "proof.json")
 
@@ -38,15 +39,16 @@ h2 {{ font-size: 1.1em }}
 <h1>Proof of a kit</h1>
 <p><strong>{verdict}</strong></p>
 <p>In each simulated episode the tools lie elsewhere on the table, and all cavities are wider or
-narrower by a random error with a standard deviation of {tolerance:g} mm. Kitted means: within
-3.5 mm of its place by ADD-S, 2 mm of its height and 20 degrees of its heading. The largest force is
-that of all contacts on the hand while it handled the tool.</p>
+narrower by a random error with a standard deviation of {tolerance:g} mm. A tool counts as kitted if
+its ADD-S is below 3.5 mm, its height error within 2 mm, and its heading error within 20 degrees.
+The largest force is that of all contacts on the hand while it handled the tool.</p>
 <p>{kit}</p><p>{pictures}</p>
 {tables}
 """
 
 Progress = Callable[[str, int, int], None]
-"""Called with what is proved, the episodes done, and their number."""
+"""A function that is called with a description of the test, the number of episodes done, and their
+total number."""
 
 
 @dataclass
@@ -58,10 +60,10 @@ class ToolProof:
     tried: int = 0
     peak_force_n: float = 0.0
     causes: Counter[str] = field(default_factory=Counter)
-    """Why it was not kitted, by the words of `results.json`."""
+    """How often the tool failed for each cause, in the words of `results.json`."""
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Returns the results as plain values for JSON."""
         return {
             "name": self.name,
             "kitted": self.kitted,
@@ -73,39 +75,40 @@ class ToolProof:
 
 @dataclass
 class KitProof:
-    """The episodes of one clearance."""
+    """The results of all episodes with one clearance."""
 
     clearance_mm: float
     tools: dict[str, ToolProof] = field(default_factory=dict)
     pictures: list[bytes] = field(default_factory=list)
-    """PNGs of the first episode's start and end."""
+    """Pictures of the start and the end of the first episode, as PNG."""
 
     @property
     def kitted(self) -> int:
-        """How often a tool was kitted, strictly."""
+        """The number of tools that were kitted, counting strict successes, over all episodes."""
         return sum(tool.kitted for tool in self.tools.values())
 
     @property
     def tried(self) -> int:
-        """Tools times episodes."""
+        """The number of tools times the number of episodes."""
         return sum(tool.tried for tool in self.tools.values())
 
     @property
     def fits(self) -> bool:
-        """Whether enough tools were kitted."""
+        """Whether the share of kitted tools reaches `GOOD`."""
         return self.kitted >= GOOD * self.tried
 
 
 def prove_kit(folder: Path, episodes: int, progress: Progress) -> str:
-    """Kits a kit in simulation, and writes `proof.html` and `proof.json` into its folder.
+    """Lets a policy fill a kit in simulation, and writes `proof.html` and `proof.json` into its
+    folder.
 
     The policy is that of the kit's scenario. In each episode the tools lie elsewhere, and all
     cavities are wider or narrower by a common random error of `TOLERANCE_MM`. A kit that does not
     fit is tried again with wider cavities.
 
     Args:
-        folder: a folder of `hkd kit`.
-        episodes: how often to kit it.
+        folder: a folder that `hkd kit` wrote.
+        episodes: number of simulated episodes.
         progress: called before each episode and at the end.
 
     Returns:
@@ -124,7 +127,7 @@ def prove_kit(folder: Path, episodes: int, progress: Progress) -> str:
         if wider[-1].fits:
             break
     verdict = _verdict(proof, wider)
-    # Written before the files, so that a later `hkd kit` may replace them.
+    # Record the names before the files are written, so that a later `hkd kit` may replace them.
     record["files"] = sorted({*record["files"], *_FILES})
     write_json(folder / "kit.json", record)
     write_json(
@@ -169,7 +172,7 @@ def _prove(folder: Path, clearance_mm: float, episodes: int, progress: Progress)
 
         result = run_chosen(chosen, diagram, station, observers=[observe] if pictured else [])
         if result.failure:
-            raise UserError(f"the kit cannot be proved: {result.failure}")
+            raise UserError(f"the simulation of the kit failed: {result.failure}")
         if pictured:
             proof.pictures = [frames[0], frames[-1]]
         for item in result.objects:
@@ -177,7 +180,7 @@ def _prove(folder: Path, clearance_mm: float, episodes: int, progress: Progress)
             tool.tried += 1
             tool.kitted += item.strict_success
             if not item.strict_success:
-                tool.causes[item.cause or "not as it should lie"] += 1
+                tool.causes[item.cause or "wrong height or heading"] += 1
         for action in result.actions_taken:
             force = action.peak_force_n
             if action.object in proof.tools and force is not None:
@@ -193,24 +196,27 @@ def _verdict(proof: KitProof, wider: list[KitProof]) -> str:
     )
     force = max((tool.peak_force_n for tool in proof.tools.values()), default=0.0)
     if proof.fits:
-        return f"It fits: {counted}, with at most {force:.0f} N."
+        return f"The kit fits: {counted}, with at most {force:.0f} N."
     worst = min(proof.tools.values(), key=lambda tool: tool.kitted / max(tool.tried, 1))
-    trouble = f"the trouble is {worst.name} ({worst.tried - worst.kitted} of {worst.tried}"
+    trouble = (
+        f"the worst tool is {worst.name} ({worst.tried - worst.kitted} of {worst.tried} failed"
+    )
     if worst.causes:
         trouble += f", mostly {worst.causes.most_common(1)[0][0]}"
     cure = next((item for item in wider if item.fits), None)
     if cure is None:
         tried = " or ".join(f"{item.clearance_mm:g}" for item in wider)
-        advice = f"A clearance of {tried} mm does not mend it."
+        advice = f"A clearance of {tried} mm is not enough either."
     else:
         advice = (
-            f"A clearance of {cure.clearance_mm:g} mm would mend it: {cure.kitted} of {cure.tried}."
+            f"A clearance of {cure.clearance_mm:g} mm would be enough: "
+            f"{cure.kitted} of {cure.tried} tools were kitted."
         )
-    return f"It does not fit well: {counted}; {trouble}). {advice}"
+    return f"The kit does not fit well: {counted}; {trouble}). {advice}"
 
 
 def _page(folder: Path, proof: KitProof, wider: list[KitProof], verdict: str) -> str:
-    """The proof as a page that needs no other file."""
+    """The proof as an HTML page that needs no other file."""
 
     def picture(data: bytes, width: int) -> str:
         encoded = base64.b64encode(data).decode()
@@ -233,7 +239,7 @@ def _page(folder: Path, proof: KitProof, wider: list[KitProof], verdict: str) ->
         tables.append(
             f"<h2>{item.clearance_mm:g} mm a side: {item.kitted} of {item.tried} "
             f"({100 * low:.0f} to {100 * high:.0f} %)</h2><table><tr><th>tool</th><th>kitted</th>"
-            f"<th>largest force</th><th>else</th></tr>{rows}</table>"
+            f"<th>largest force</th><th>failures</th></tr>{rows}</table>"
         )
     return _PAGE.format(
         verdict=html.escape(verdict),

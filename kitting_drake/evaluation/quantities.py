@@ -1,4 +1,4 @@
-"""Formats counts and times with three digits and a prefix, and tables of them."""
+"""Formats counts and times with three digits and a unit prefix, and makes tables of them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Summarises many episodes as `summary.json`."""
+"""Computes the summary of many episodes that `summary.json` holds."""
 
 import math
 from collections import Counter
@@ -23,14 +23,16 @@ TIMED_OUT = "timed out"
 """The cause of all objects of an episode that timed out."""
 
 UNKNOWN = "unknown"
-"""A failed episode counts as one object of this category if no other episode has objects."""
+"""The category of the single object that a failed episode counts as if no other episode has
+objects."""
 
 AMBIGUITIES = {
     "protruding": ("height_error_mm", 1e3 * STRICT_HEIGHT),
     "reversed": ("angle_error_deg", math.degrees(STRICT_ANGLE)),
 }
-"""Reasons why a success is not strict: an error that the task's success predicate tolerates, and
-its limit. The angle is modulo the object's declared symmetry."""
+"""Reasons why a success is not strict. Each is an error that the task's success predicate
+tolerates, with the limit for a strict success. The angle is modulo the object's declared
+symmetry."""
 
 _FAILED_GRASPS = ("missed", "dropped", "stopped")
 """The outcomes of an action whose grasp was missed or lost, or that the force guard stopped."""
@@ -57,19 +59,19 @@ def summarise(
     """Computes the content of `summary.json`.
 
     - Rates are means of the episodes' rewards; failed and timed-out episodes count 0.
-    - Intervals are Wilson's over objects if the reward is the share of successful objects and the
-      task declares its objects independent. Otherwise (partial rewards, weights, stacks) they are
-      over episodes, see `mean_interval`. `ci95_method` names the method.
-    - `outcomes` holds for each episode its seed, both rates, and for each object 2 (strict
-      success), 1 (success) or 0. It allows paired comparisons of runs with the same seeds.
-    - Errors include all objects and actions of completed episodes, failures too. Objects for which
-      no goal was left are excluded.
+    - If the reward is the share of successful objects, and the task declares its objects
+      independent, intervals are Wilson's over objects. Otherwise (partial rewards, weights, stacks)
+      they are over episodes, see `mean_interval`. `ci95_method` names the method.
+    - `outcomes` holds the seed of each episode, both rates, and for each object 2 (strict success),
+      1 (success) or 0 (failure). It allows paired comparisons of runs with the same seeds.
+    - Errors include all objects and actions of completed episodes, also those that failed. Objects
+      for which no goal was left are excluded.
     - `measures` holds the rate of success by each other measure of the task, over objects.
 
     Args:
-        episodes: at least one.
+        episodes: at least one episode.
         chosen: the scenario.
-        success: the success predicate of its scenes.
+        success: the success predicate of the scenario's scenes.
         wall_seconds_total: total duration of the calls that ran the episodes, in s. In contrast,
             `wall_seconds` is the sum of the episodes' durations.
     """
@@ -125,14 +127,15 @@ def summarise(
 
 
 def _commits(episodes: Sequence[Episode]) -> str | None:
-    """The commits of the code that ran the episodes: several if other code resumed the evaluation.
-    Defaults to the present one for episodes without a commit."""
+    """The commits of the code that ran the episodes. There are several if the evaluation was
+    resumed with other code. For episodes without a commit the present one is used."""
     found = dict.fromkeys(str(episode["commit"]) for episode in episodes if episode.get("commit"))
     return ", ".join(found) or commit()
 
 
 def _stop_reasons(episodes: Sequence[Episode]) -> dict[str, dict[str, int]]:
-    """For each reason, how often it was right and wrong; see `kitting_drake.episode.ending`."""
+    """How often each reason for stopping was right and wrong; see
+    `kitting_drake.episode.ending`."""
     found: dict[str, dict[str, int]] = {}
     for episode in episodes:
         verdict = episode.get("stop_reason_right")
@@ -151,7 +154,7 @@ def peak_forces(episodes: Sequence[Episode]) -> list[Entry]:
 
 
 def needless_actions(episode: Episode) -> int:
-    """The number of actions on objects for which no goal was left. Success rates do not show them,
+    """The number of actions on objects for which no goal was left. Success rates do not count them,
     but they may do harm."""
     useful = {item["name"] for item in episode["objects"] if item["add_s_mm"] is not None}
     if not useful:
@@ -161,19 +164,19 @@ def needless_actions(episode: Episode) -> int:
 
 
 def actions_after_failed_grasp(episode: Episode) -> int:
-    """The number of actions after the first missed or lost grasp of the episode. A policy with a
-    memory of failed grasps may decide them differently."""
+    """The number of actions after the episode's first missed or lost grasp. In these actions a
+    policy with a memory of failed grasps may decide differently."""
     outcomes = [action["outcome"] for action in episode["actions_taken"]]
     failed = [index for index, outcome in enumerate(outcomes) if outcome in _FAILED_GRASPS]
     return len(outcomes) - 1 - failed[0] if failed else 0
 
 
 def counted_objects(episodes: Sequence[Episode]) -> list[list[Entry]]:
-    """The objects of each episode that count, i.e. for which a goal was left.
+    """The objects of each episode that count, which are those for which a goal was left.
 
-    In a failed or timed-out episode no object is a success or has errors. If its process died, the
-    names of its objects may be unknown. It then gets, for each category, the largest number of
-    objects in any other episode.
+    In a failed or timed-out episode no object is a success or has errors. If the episode's process
+    died, the names of its objects may be unknown. It then counts, for each category, as many
+    objects as the episode with the most of them.
     """
     found = [
         [item for item in episode["objects"] if item["add_s_mm"] is not None]
@@ -227,7 +230,7 @@ def counted_actions(episodes: Sequence[Episode]) -> list[Entry]:
 def _rates(
     episodes: Sequence[Episode], objects_of: list[list[Entry]], are_independent: bool
 ) -> dict[str, Any]:
-    """Both rates and their intervals."""
+    """The rates of successes and of strict successes, with their intervals."""
     scores, strict_scores = (
         [float(episode[key]) for episode in episodes]
         for key in ("success_rate", "strict_success_rate")
@@ -260,7 +263,8 @@ def _rates(
 
 
 def _measures(objects: Sequence[Entry]) -> dict[str, dict[str, Any]]:
-    """The rates by the task's other measures. A lost object is no success by any of them."""
+    """The success rates by the task's other measures. An object without a recorded result is not a
+    success by any of them."""
     names = dict.fromkeys(name for item in objects for name in item.get("measures") or {})
     counts = {
         name: sum((item.get("measures") or {}).get(name, False) for item in objects)

@@ -1,4 +1,4 @@
-"""The figure beside `summary.json`: placement errors and causes of failure."""
+"""Draws the figure beside `summary.json`, with placement errors and causes of failure."""
 
 import io
 import itertools
@@ -33,7 +33,7 @@ _STYLE = {
 
 _LENGTHS = (0.1, 300.0)
 _ANGLES = (0.02, 180.0)
-"""Ranges of the axes, in mm and degrees; values outside are drawn at their ends."""
+"""Ranges of the axes, in mm and degrees. Values outside a range are drawn at its end."""
 
 
 @dataclass(frozen=True)
@@ -66,15 +66,16 @@ _PANELS = (
 def draw_summary(summary: dict[str, Any], episodes: Sequence[Episode], path: Path) -> None:
     """Draws the distributions behind a summary.
 
-    Three panels show, for each category, the share of objects with an error of at most x: ADD-S
-    (with the task's threshold, if any), position and angle. Position and angle also show the errors
-    of the policy's actions, i.e. without slip. Objects of failed or timed-out episodes count as
-    errors beyond all x. The fourth panel counts the causes.
+    Three panels show, for each category, the share of objects with an error of at most x. The
+    errors are ADD-S (with the task's threshold, if any), position and angle. The panels of position
+    and angle also show the errors of the policy's actions, which do not include slip. Objects of
+    failed or timed-out episodes count as infinite errors. The fourth panel counts the causes of
+    failure.
 
     Args:
         summary: the result of `summarise`.
-        episodes: all of them.
-        path: a .png file.
+        episodes: all episodes of the summary.
+        path: path of the .png file.
 
     Raises:
         MachineError: writing fails.
@@ -107,7 +108,7 @@ def draw_summary(summary: dict[str, Any], episodes: Sequence[Episode], path: Pat
 
 
 def _looks() -> Iterable[_Look]:
-    """Distinct styles for 21 categories, then the same again."""
+    """Yields distinct styles for 21 categories, then the same styles again."""
     return itertools.cycle(
         _Look(colour, line, hatch)
         for line, hatch in zip(_LINES, _HATCHES, strict=True)

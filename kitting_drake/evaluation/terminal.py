@@ -1,4 +1,4 @@
-"""Tables for the terminal: of one episode, and of a summary."""
+"""Makes the terminal's tables of one episode and of a summary."""
 
 import dataclasses
 from typing import Any
@@ -119,7 +119,7 @@ def summary_table(summary: dict[str, Any]) -> Table:
     table = Table(title=_summary_title(summary), title_justify="left")
     table.add_column("category", no_wrap=True)
     for heading in ("strict", "success", "ADD-S mm", "95 %", *_ERROR_HEADINGS[1:]):
-        # In a narrow terminal, break headings between words only.
+        # In a narrow terminal, break headings only between words.
         table.add_column(heading, justify="right", min_width=max(map(len, heading.split())))
     categories = summary["categories"]
     rows = [(name, row, _counts(row)) for name, row in categories.items()]
@@ -160,7 +160,8 @@ def _counts(category: dict[str, Any]) -> tuple[int, int, int]:
 
 
 def summary_notes(summary: dict[str, Any]) -> str:
-    """The lines below the table: causes, ambiguous successes, and errors of the actions."""
+    """The lines below the table: causes of failure, successes that are not strict, and errors of
+    the actions."""
     causes = [f"{count} {cause}" for cause, count in summary["causes"].items() if count]
     ambiguous = [f"{count} {name}" for name, count in summary["ambiguous"].items() if count]
     pick_position, pick_angle, place_position, place_angle = (

@@ -19,8 +19,8 @@ SCENARIOS = {
     "PalletizingBoxes": ("ravens.yaml", "PalletizingBoxes"),
     "AssemblingKits": ("assembling_kits.yaml", "Train"),
 }
-"""The file and the scenario of each environment, except for `Scenario`, which gets them by
-argument."""
+"""The file and the scenario of each environment, except for the environment `Scenario`, which takes
+them as arguments."""
 JOINTS = "KittingJoint"
 """The environment that takes joint targets. By default its scenario is that of `KittingUnseen`."""
 
@@ -37,9 +37,10 @@ def _register_environments() -> None:
         file, scenario = SCENARIOS.get(name, (None, None))
         gymnasium.register(
             f"kitting_drake/{name}-v0",
-            # A string, so that Drake, which loads slowly, is imported only with an environment.
+            # The entry point is a string, so that Drake, which loads slowly, is imported only when
+            # an environment is made.
             entry_point="kitting_drake.gym.environment:KittingEnvironment",
-            # By path, as the working directory may contain a file of the same name.
+            # Use the full path, because the working directory may contain a file of the same name.
             kwargs={}
             if file is None
             else {"scenario": str(paths.SCENARIOS / file), "scenario_name": scenario},

@@ -33,7 +33,7 @@ from systems.surface_heights import read_surface_heights
 
 
 class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
-    """A scenario's station. The agent replaces the scenario's policy.
+    """A scenario's station as an environment. The agent replaces the scenario's policy.
 
     - Observation and action: see `gym.spaces`. The observation is o_t at the time when a policy
       would be called, while the hand waits out of the cameras' sight.
@@ -44,9 +44,10 @@ class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
       left, or the simulation failed (`info["failure"]`).
     - `info`: the present values of the keys of `results.json`, without `wall_seconds`, which would
       not be reproducible; `failed_picks`, (x, y, theta) of each failed grasp; and `history`, the
-      earlier actions as dicts: `action`, `outcome`, `peak_force` (N).
-    - `reset(seed=N)` makes the scene of seed N, as in `evaluate` and `run`; without a seed, a
-      random one. `info["seed"]` holds it. It has no `options`, and warns of any that are given.
+      earlier actions as dicts with the keys `action`, `outcome` and `peak_force` (N).
+    - `reset(seed=N)` makes the scene of seed N, as in `evaluate` and `run`. Without a seed, it
+      chooses one at random. `info["seed"]` holds the seed. `reset` has no `options`, and warns of
+      any that are given.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 1}  # noqa: RUF012  Gymnasium's own way.
@@ -64,8 +65,8 @@ class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         """
         Args:
             scenario: a scenario file, or the name of one of the project's; its policy is ignored.
-            scenario_name: a scenario in the file; None: the first.
-            scenario_text: YAML merged over it.
+            scenario_name: name of a scenario in the file; None for the first.
+            scenario_text: YAML that is merged over the scenario.
             perturb: perturbations, as for `--perturb`.
             cameras: whether observations also contain the cameras' images.
             render_mode: `rgb_array` for `render`, or None.
@@ -98,7 +99,7 @@ class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Makes a new scene; see Gymnasium and the class.
+        """Makes a new scene, as Gymnasium and the docstring of the class describe.
 
         Raises:
             ValueError: the seed is invalid.
@@ -145,10 +146,11 @@ class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         return station
 
     def step(self, action: ArrayLike) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """Executes one pick and place, or stops; see Gymnasium and the class.
+        """Executes one pick and place, or stops, as Gymnasium and the docstring of the class
+        describe.
 
         Args:
-            action: (7,): `gym.spaces.ACTION`. Positions are clipped to the workspace.
+            action: (7,) the entries of `gym.spaces.ACTION`. Positions are clipped to the workspace.
 
         Raises:
             ValueError: the action is not seven finite numbers.
@@ -162,7 +164,7 @@ class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         result = episode.result()
         is_done = result.success_rate > ALL
         if is_done and not episode.is_over:
-            # The task is finished: stop in place of the agent, as a policy would.
+            # The task is finished, so stop in place of the agent, as a policy would.
             self._give(episode, PickPlaceAction(stop=True))
             result = episode.result()
             is_done = result.success_rate > ALL
@@ -173,7 +175,7 @@ class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         return self._observe(), reward, terminated, truncated, self._info(result)
 
     def render(self) -> NDArray[np.uint8] | None:
-        """(800, 1280, 3) picture of the whole cell now; None without a render mode.
+        """(800, 1280, 3) picture of the whole cell at present; None without a render mode.
 
         Raises:
             gymnasium.error.ResetNeeded: there is no scene yet.
@@ -189,7 +191,7 @@ class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
     def close(self) -> None:
         """Frees the simulation. With Python 3.11, Drake 1.51 leaks about 35 MB nevertheless."""
         self._station = self._episode = None
-        # A Diagram and its systems form reference cycles.
+        # A Diagram and its systems form reference cycles, which only the garbage collector frees.
         gc.collect()
 
     def _give(self, episode: Episode, action: PickPlaceAction) -> None:
@@ -212,7 +214,7 @@ class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         return self._station.GetOutputPort(port).Eval(self._episode.context)
 
     def _with_heights(self, action: PickPlaceAction) -> PickPlaceAction:
-        """The action with heights, read off the agent's o_t."""
+        """Adds surface heights, read off the agent's o_t, to the action."""
         heights = read_surface_heights(self._observation(), action.pick, action.place)
         return dataclasses.replace(action, heights=heights)
 

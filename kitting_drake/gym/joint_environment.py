@@ -1,4 +1,4 @@
-"""The Gymnasium environment at the level of joints: one step is one control period."""
+"""The Gymnasium environment whose actions are joint targets: one step is one control period."""
 
 import dataclasses
 import gc
@@ -40,12 +40,13 @@ from systems.signals import PickPlaceAction
 
 
 class JointEnvironment(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32]]):
-    """A scenario's station whose joints the agent commands. Policy and planner do nothing.
+    """A scenario's station as an environment in which the agent commands the joints. Policy and
+    planner do nothing.
 
     - Names and values are those of `collect --export lerobot`: see `policies.data.frames`.
     - Observation: `observation.state`, and `observation.images.CAMERA` of each camera.
     - Action: a target for each of `names`, in m and rad, to be reached at the end of the period.
-      Commands move there in a straight line, no faster than the joints' velocity limits.
+      Commands move to it in a straight line, no faster than the joints' velocity limits.
     - Reward: the increase of the task's reward. It adds up to 1 when every goal is filled.
     - Terminated: every goal is filled and all objects rest, released. Truncated: the scenario's
       `time_limit` is over, or the simulation failed (`info["failure"]`).
@@ -70,12 +71,12 @@ class JointEnvironment(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32
         """
         Args:
             scenario: a scenario file, or the name of one of the project's.
-            scenario_name: a scenario in the file; None: the first.
+            scenario_name: name of a scenario in the file; None for the first.
             scenario_text: YAML merged over it, such as `{robot: !FrankaArm {}}`.
             perturb: perturbations, as for `--perturb`.
             fps: steps per simulated second.
             image_width: largest width of the images, in pixels.
-            cameras: whose images to observe; empty: all.
+            cameras: names of the cameras whose images are observed; empty for all.
             render_mode: `rgb_array` for `render`, or None.
 
         Raises:
@@ -116,7 +117,7 @@ class JointEnvironment(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32
         return self._chosen.scenario
 
     def _limits(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float64]]:
-        """Smallest and largest targets, and the largest rate of each joint."""
+        """The smallest and largest targets, and the largest rates of the joints."""
         plant = MultibodyPlant(self.scenario.plant.time_step)
         scene_graph = SceneGraph()
         plant.RegisterAsSourceForSceneGraph(scene_graph)
@@ -127,7 +128,7 @@ class JointEnvironment(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32
         high = [float(joint.position_upper_limits()[0]) for joint in joints]
         rates = [float(joint.velocity_upper_limits()[0]) for joint in joints]
         config = self.scenario.controller
-        # See `FingerLaw`: beyond this the fingers pull no harder.
+        # See `FingerLaw`: with a smaller opening than this the fingers do not pull harder.
         tightest = -2 * config.finger_force_limit / config.finger_stiffness
         return (
             np.array([*low, tightest], np.float32),
@@ -138,7 +139,8 @@ class JointEnvironment(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-        """Makes a new scene, that of `evaluate --seed N`; a random one without a seed.
+        """Makes the scene of a seed, as in `evaluate --seed N`. Without a seed, it chooses one at
+        random.
 
         Raises:
             ValueError: the seed is invalid.
@@ -158,7 +160,7 @@ class JointEnvironment(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32
         if self.render_mode is not None:
             add_picture_renderer(station.scene_graph)
         self._station, self._simulator = station, station.make_simulator()
-        # The planner does nothing from its first question on.
+        # Stop the planner when it first asks for an action.
         stop = Value(PickPlaceAction(stop=True))
         station.GetInputPort("action").FixValue(self._context, stop)
         self._target = self._view.command(self._context).astype(float)
@@ -170,7 +172,7 @@ class JointEnvironment(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32
     def step(
         self, action: ArrayLike
     ) -> tuple[dict[str, NDArray[Any]], float, bool, bool, dict[str, Any]]:
-        """Advances by one period; see the class.
+        """Advances by one control period, as the docstring of the class describes.
 
         Args:
             action: a target for each of `names`, clipped to the `action_space`.
@@ -200,7 +202,7 @@ class JointEnvironment(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32
         return self._observe(), float(gained), terminated, truncated, self._info(failure)
 
     def _advance(self, given: NDArray[np.float64]) -> None:
-        """Moves the commands to the targets, and the simulation with them."""
+        """Moves the commands step by step to the targets, and advances the simulation meanwhile."""
         assert self._station is not None and self._simulator is not None
         space, fps = self.action_space, self._recording.fps
         assert isinstance(space, spaces.Box)
@@ -251,7 +253,7 @@ class JointEnvironment(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32
         }
 
     def render(self) -> NDArray[np.uint8] | None:
-        """(800, 1280, 3) picture of the whole cell now; None without a render mode.
+        """(800, 1280, 3) picture of the whole cell at present; None without a render mode.
 
         Raises:
             gymnasium.error.ResetNeeded: there is no scene yet.
@@ -268,5 +270,5 @@ class JointEnvironment(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32
         """Frees the simulation."""
         self._station = self._simulator = self._view = None
         self._is_over = True
-        # A Diagram and its systems form reference cycles.
+        # A Diagram and its systems form reference cycles, which only the garbage collector frees.
         gc.collect()

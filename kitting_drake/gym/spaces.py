@@ -11,24 +11,27 @@ from kitting_drake.scenario.schema import Scenario
 from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
 
 ACTION = ("pick_x", "pick_y", "pick_theta", "place_x", "place_y", "place_theta", "stop")
-"""The entries of an action: the gripper's poses in the world, in metres and radians, and `stop`, 0
-to 1: above `STOP` the episode ends."""
+"""The entries of an action: the gripper's poses in the world, in metres and radians, and `stop`
+from 0 to 1. If `stop` is above `STOP`, the episode ends."""
 STOP = 0.95
-"""So close to 1 that a random agent seldom stops."""
+"""An action stops the episode if its `stop` is above this. The value is close to 1, so that a
+random agent seldom stops."""
 _ANGLES = [2, 5]
 
 
 def action_space(grid: PixelGrid) -> spaces.Box:
-    """(7,) float64: `ACTION`, with positions in the workspace and angles in [-pi, pi]."""
+    """The space of actions, (7,) float64 with the entries `ACTION`: positions in the workspace and
+    angles in [-pi, pi]."""
     low, high = (grid.x_min, grid.y_min, -math.pi), (grid.x_max, grid.y_max, math.pi)
     return spaces.Box(np.array([*low, *low, 0.0]), np.array([*high, *high, 1.0]), dtype=np.float64)
 
 
 def observation_space(scenario: Scenario, *, cameras: bool) -> spaces.Dict:
-    """`colour` (rows, cols, 3), `height` (rows, cols) in metres above the table, `valid` and
-    `in_view` (rows, cols), as in `Observation`. With `cameras`, also the images of each camera
-    under that key: `colour` (height, width, 3) and `depth` (height, width) in metres, infinity
-    where too far and 0 where too near."""
+    """The space of observations, a dict with `colour` (rows, cols, 3), `height` (rows, cols) in
+    metres above the table, `valid` and `in_view` (rows, cols), as in `Observation`. With `cameras`,
+    the key `cameras` holds the images of each camera: `colour` (height, width, 3) and `depth`
+    (height, width) in metres, which is infinite for points that are too far and 0 for points that
+    are too near."""
     grid = scenario.heightmap.grid()
     depth_range = grid.z_max - grid.z_min
     parts: dict[str, spaces.Space[Any]] = {
@@ -52,7 +55,7 @@ def observation_space(scenario: Scenario, *, cameras: bool) -> spaces.Dict:
 
 
 def as_arrays(observation: Observation) -> dict[str, NDArray[Any]]:
-    """o_t as arrays, with colours rounded to 8 bits."""
+    """Converts the observation o_t to arrays, with colours rounded to 8 bits."""
     colour = np.rint(255 * np.moveaxis(observation.rgb, 0, -1)).astype(np.uint8)
     return {
         "colour": colour,
@@ -63,7 +66,7 @@ def as_arrays(observation: Observation) -> dict[str, NDArray[Any]]:
 
 
 def as_observation(arrays: dict[str, Any], grid: PixelGrid) -> Observation:
-    """The inverse of `as_arrays`, for policies.
+    """Converts arrays back to an observation, for policies; the inverse of `as_arrays`.
 
     Args:
         arrays: an environment's observation.
@@ -76,7 +79,7 @@ def as_observation(arrays: dict[str, Any], grid: PixelGrid) -> Observation:
 
 
 def as_action(values: ArrayLike, grid: PixelGrid) -> PickPlaceAction:
-    """The action of seven numbers; positions are clipped to the workspace.
+    """Converts seven numbers to an action. Positions are clipped to the workspace.
 
     Raises:
         ValueError: the shape is not (7,), or a number is not finite.
@@ -89,14 +92,15 @@ def as_action(values: ArrayLike, grid: PixelGrid) -> PickPlaceAction:
             raise ValueError(f"{name} of an action must be a finite number, not {value}")
     space = action_space(grid)
     held = np.clip(array, space.low, space.high)
-    # Angles need no clipping: they are equivalent modulo 2 pi.
+    # Angles are equivalent modulo 2 pi, so do not clip them.
     held[_ANGLES] = array[_ANGLES]
     pick, place = PlanarPose(*held[:3].tolist()), PlanarPose(*held[3:6].tolist())
     return PickPlaceAction(pick, place, stop=bool(array[6] > STOP))
 
 
 def as_values(action: PickPlaceAction) -> NDArray[np.float64]:
-    """(7,) the inverse of `as_action`, for a policy's action.
+    """Converts a policy's action to the numbers (7,) of an environment's action; the inverse of
+    `as_action`.
 
     Raises:
         ValueError: the action presses, which environments do not support.

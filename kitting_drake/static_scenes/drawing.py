@@ -1,9 +1,9 @@
 """Draws static training scenes: random tools and kits, rendered without physics.
 
-For each batch, tools are drawn (`hkd.generation.random_tools`). Each kit is laid out for some of
-them and rendered in several scenes, with varying poses, seated tools, clutter and camera noise.
-Labels follow from the geometry: every grasp with room for the jaws, and the pose that seats the
-tool.
+For each batch, random tools are drawn (`hkd.generation.random_tools`). Each kit is laid out for
+some of these tools and rendered in several scenes, which differ in poses, seated tools, clutter and
+camera noise. The labels follow from the geometry: all grasps at which the jaws have room, and the
+pose at which a tool is seated.
 """
 
 from collections.abc import Iterator, Sequence
@@ -60,21 +60,23 @@ from systems.signals import Observation, PixelGrid
 _TOOLS_A_BATCH = 12
 _TOOLSETS_A_BATCH = 10
 _SCENES_A_TOOLSET = 4
-"""The most scenes of a toolset. A toolset is left out if there is no room for it."""
+"""The largest number of scenes of one set of tools. A scene is left out if there is no room for its
+tools."""
 
 _COUNTS = np.array([2, 4, 8, 24, 8, 6, 4, 2, 2, 1, 1, 1], float)
-"""Relative frequencies of kits with 1, 2, ... 12 tools; four is most frequent."""
+"""Relative frequencies of kits with 1, 2, ... 12 tools. Four tools are most frequent."""
 _MOST_LOOSE = 8
-"""Largest number of loose tools; the others are seated, because the workspace is too small."""
+"""Largest number of loose tools in a scene. All others are seated, because the workspace is too
+small for more."""
 _CLUTTERED = 0.5
-"""Share of scenes with clutter, i.e. objects without a cavity."""
+"""Share of scenes with clutter, which are objects without a cavity."""
 _MOST_STRANGERS, _MOST_BOXES = 2, 6
 """Largest numbers of other tools and of boxes in the clutter."""
 _STARTS = {"apart": 0.6, "touching": 0.28, "crossed": 0.04, "leaning": 0.04, "heap": 0.04}
-"""How the loose tools lie, with the share of scenes."""
+"""Ways in which the loose tools lie, each with its share of the scenes."""
 _FLAT, _ON_TABLE = np.cos(np.radians(2.0)), 0.001
-"""A tool lies flat if the cosine of its tilt is above this, and its origin is this near the table,
-in metres."""
+"""A tool lies flat if the cosine of its tilt is above the first number, and its origin is closer to
+the table than the second, in metres."""
 _WALL = 0.003
 _IN_CAVITY = 0.0008
 """Standard deviation of a seated tool's position in its cavity, in metres."""
@@ -86,18 +88,18 @@ Body = tuple[str, RigidTransform]
 
 @dataclass(frozen=True)
 class LooseTool:
-    """A tool on the table, and where it belongs."""
+    """A loose tool on the table, and the pose at which it is seated."""
 
     tool: RandomTool
     X_WT: RigidTransform
     X_WGoal: RigidTransform
     around: tuple[CrossSection, ...]
-    """The outlines of everything else that stands on the table."""
+    """The outlines of everything else on the table, seen from above, in metres."""
 
 
 @dataclass(frozen=True)
 class DrawnScene:
-    """A scene with its truth, before it is rendered."""
+    """A scene with its true poses, before it is rendered."""
 
     bodies: tuple[Body, ...]
     loose: tuple[LooseTool, ...]
@@ -106,11 +108,11 @@ class DrawnScene:
     noise_seed: int
 
     def render(self, grid: PixelGrid) -> Observation:
-        """o_t, heights only."""
+        """Renders the observation o_t with heights only."""
         return render(self.bodies, grid, self.noise, self.noise_seed, self.cameras)
 
     def static_scene(self) -> StaticScene:
-        """The scene as a sample for training."""
+        """Renders the scene and adds the labels for training."""
         rows = []
         for number, loose in enumerate(self.loose):
             rows += _actions(number, loose)
@@ -128,8 +130,8 @@ def draw_scenes(seed: int, *, random_views: bool = False) -> Iterator[DrawnScene
 
     Args:
         seed: the seed of all draws. Different seeds share neither tools nor kits.
-        random_views: one to three cameras at random poses (`draw_views`) instead of the default
-            cameras.
+        random_views: whether to use one to three cameras at random poses (`draw_views`) instead of
+            the default cameras.
 
     Raises:
         MachineError: this machine cannot render.
@@ -143,23 +145,24 @@ def draw_scenes(seed: int, *, random_views: bool = False) -> Iterator[DrawnScene
         count = 1 + int(rng.choice(len(_COUNTS), p=_COUNTS / _COUNTS.sum()))
         chosen = [tools[i] for i in rng.choice(len(tools), count, replace=False)]
         if rng.random() < 0.5:
-            # Tools of one category are nested. Four of different categories take a toolset's slots.
+            # Give all tools the same category, so that the kit's layout nests them. Four tools of
+            # different categories would get the fixed slots of a toolset.
             chosen = [replace(tool, category="drawn") for tool in chosen]
         try:
             kit = _draw_kit(chosen, rng)
             others = [tool for tool in tools if all(tool.name != own.name for own in chosen)]
             for scene in range(_SCENES_A_TOOLSET):
-                # A separate stream makes the noise independent of the scene.
+                # Use a separate random stream, so that the noise is independent of the scene.
                 own = np.random.SeedSequence([seed, 1, number, scene])
                 noise_seed = int(own.generate_state(1)[0])
                 drawn = _draw_scene(kit, chosen, others, rng, noise_seed)
                 if random_views:
-                    # A separate stream, so that the views do not change the scenes.
+                    # Use a separate random stream, so that the views do not change the scenes.
                     own = np.random.SeedSequence([seed, 2, number, scene])
                     drawn = replace(drawn, cameras=draw_views(np.random.default_rng(own)))
                 yield drawn
         except UserError:
-            # There is no room for these tools.
+            # There is no room for these tools, so leave out the scene.
             continue
 
 
@@ -167,7 +170,7 @@ def draw_scenes(seed: int, *, random_views: bool = False) -> Iterator[DrawnScene
 class _DrawnKit:
     kit: Kit
     text: str
-    """The block as Wavefront text."""
+    """The kit's block as a mesh in Wavefront text."""
 
 
 def _draw_kit(tools: Sequence[RandomTool], rng: np.random.Generator) -> _DrawnKit:
@@ -190,7 +193,8 @@ def _draw_scene(
     rng: np.random.Generator,
     noise_seed: int,
 ) -> DrawnScene:
-    """A scene of a kit, its tools, and perhaps other tools without a cavity as clutter."""
+    """Draws a scene of a kit and its tools, in some scenes with other tools without a cavity as
+    clutter."""
     grid = PixelGrid()
     kit = drawn.kit
     loose = _draw_loose(len(tools), rng)
@@ -239,7 +243,7 @@ def _draw_scene(
 def _draw_poses(
     kit: Kit, tools: Sequence[RandomTool], grid: PixelGrid, rng: np.random.Generator
 ) -> tuple[RigidTransform, Sequence[RigidTransform]]:
-    """X_W of the kit and of loose tools, which may touch or lie on each other.
+    """Draws poses in the world of the kit and of loose tools, which may touch or lie on each other.
 
     Raises:
         UserError: there is no room.
@@ -276,7 +280,8 @@ def _lies_flat(X_WT: RigidTransform) -> bool:
 
 
 def _outline(tool: RandomTool, X_WT: RigidTransform) -> CrossSection:
-    """The outline from above; that of the hull for a tool that does not lie flat."""
+    """The outline of a tool seen from above, in metres. For a tool that does not lie flat it is
+    that of its convex hull."""
     if _lies_flat(X_WT):
         return outline_at(tool.footprint, X_WT)
     return projected(tool.triangles.reshape(-1, 3), X_WT)
@@ -292,11 +297,11 @@ def _draw_loose(count: int, rng: np.random.Generator) -> list[int]:
 
 
 def _actions(number: int, loose: LooseTool) -> list[tuple[float, ...]]:
-    """The rows of `StaticScene.actions` of one loose tool."""
+    """The rows of `StaticScene.actions` for one loose tool."""
     rows: list[tuple[float, ...]] = []
     X_WT, X_WGoal = loose.X_WT, loose.X_WGoal
     if not _lies_flat(X_WT):
-        # It must be laid aside first.
+        # The tool must be laid aside before it can be placed, so it has no actions.
         return rows
     yaw = RollPitchYaw(X_WT.rotation()).yaw_angle()
     rotation = RollPitchYaw(X_WGoal.rotation()).yaw_angle() - yaw
@@ -314,7 +319,8 @@ def _actions(number: int, loose: LooseTool) -> list[tuple[float, ...]]:
 
 
 def _draw_noise(rng: np.random.Generator) -> SensorNoiseParameters:
-    """Draws camera noise, from none to that of a poorly calibrated, poor camera."""
+    """Draws parameters of the camera noise, from none to that of a poor camera with a poor
+    calibration."""
     if rng.random() < 0.25:
         return SensorNoiseParameters()
     severity = rng.uniform(0.0, 1.0, 8)
@@ -339,10 +345,10 @@ def render(
     seed: int,
     views: dict[str, Camera],
 ) -> Observation:
-    """Renders o_t of bodies on a table. Heights only; colours are black.
+    """Renders the observation o_t of bodies on a table, with heights only; colours are black.
 
     Args:
-        bodies: on the table, the plane z = 0.
+        bodies: the bodies on the table, whose top is the plane z = 0.
         grid: the pixels of the observation.
         noise: the noise of the cameras.
         seed: the seed of the noise.
@@ -404,5 +410,5 @@ def _solid_text(solid: Manifold) -> str:
 
 
 def _obj(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> str:
-    """Wavefront text with face normals, which the renderer needs."""
+    """A mesh as Wavefront text with face normals, which the renderer needs."""
     return flat_obj(vertices, faces, digits=6, normal_digits=3)

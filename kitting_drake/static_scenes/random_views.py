@@ -1,4 +1,4 @@
-"""Draws cameras at random poses, as people put them up."""
+"""Draws cameras at random poses, such as people would choose."""
 
 import math
 
@@ -11,25 +11,27 @@ _COUNTS = (0.5, 0.25, 0.25)
 _STEEPEST = 60.0
 """The largest angle of a viewing direction from straight down, in degrees."""
 _DISTANCE = (0.65, 1.1)
-"""From the camera to the point that it looks at, in metres."""
+"""Range of the distance from a camera to the point that it looks at, in metres."""
 _MIDDLE, _ASIDE = (0.5, 0.0), (0.08, 0.15)
-"""The point that it looks at: the workspace's middle, and how far beside it, in metres."""
+"""The point that a camera looks at: the workspace's middle (x, y), and the largest deviation from
+it along x and y, in metres."""
 _FOCAL = (430.0, 620.0)
-"""Focal lengths, in pixels of an image of 640 x 480."""
+"""Range of the focal lengths, in pixels of an image of 640 x 480 pixels."""
 
 
 def draw_views(rng: np.random.Generator) -> dict[str, Camera]:
-    """One to three cameras of 640 x 480 pixels that look at the workspace.
+    """Draws one to three cameras of 640 x 480 pixels that look at the workspace.
 
     Args:
-        rng: for all draws.
+        rng: the generator of all random draws.
     """
     count = 1 + int(rng.choice(len(_COUNTS), p=_COUNTS))
     return {f"camera_{number}": _draw_view(rng) for number in range(count)}
 
 
 def _draw_view(rng: np.random.Generator) -> Camera:
-    # Uniform on the sphere, but never exactly straight down, where upright is undefined.
+    # Draw the direction uniformly on the sphere, but never exactly straight down, where the
+    # camera's upright direction is undefined.
     steepest = math.cos(math.radians(_STEEPEST))
     slant = math.acos(rng.uniform(steepest, math.cos(math.radians(2.0))))
     azimuth, distance = rng.uniform(0, math.tau), rng.uniform(*_DISTANCE)

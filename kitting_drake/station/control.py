@@ -33,12 +33,12 @@ _EXPORTED = {
     "desired_opening": "commanded_opening",
     "closing_force": "commanded_closing_force",
 }
-"""Names of the planner's output ports, and the station's names for them."""
+"""The station's name for each of the planner's output ports."""
 
 
 @dataclass(frozen=True)
 class _Driven:
-    """A robot with its controller, in the Diagram."""
+    """Ports of a robot with its controller."""
 
     controller: JointController | TrajectoryController
     robot_state: OutputPort
@@ -46,7 +46,7 @@ class _Driven:
     wrist_force: OutputPort
     actuation: OutputPort
     wrist_moment: OutputPort | None = None
-    """None for an arm."""
+    """The moment about the hand's y axis, for the planner's port of that name; None for an arm."""
 
 
 def add_control(
@@ -65,13 +65,13 @@ def add_control(
     Args:
         builder: the builder of the station.
         scenario: configures planner and controller.
-        scene: says how many actions there are, and whether objects are inserted.
-        plant: finalized, with the robot.
+        scene: determines the number of actions, and whether objects are inserted into cavities.
+        plant: the finalized plant, with the robot.
         projector: provides o_t, from which the planner reads heights; None if each action carries
             its heights.
-        motion: the robot's.
+        motion: computes the robot's motions.
         seed: the seed of the noise of an arm's wrist force.
-        takes_joint_targets: whether the controller's inputs are exported, instead of connected to
+        takes_joint_targets: whether the controller's inputs are exported instead of connected to
             the planner.
     """
     planner = builder.AddNamedSystem(
@@ -139,7 +139,7 @@ def _drive_hand(builder: DiagramBuilder, scenario: Scenario, plant: MultibodyPla
 def drive_arm(
     builder: DiagramBuilder, scenario: Scenario, robot: FrankaArm, plant: MultibodyPlant, seed: int
 ) -> _Driven:
-    """Adds the controller of an arm, and what it senses."""
+    """Adds the controller of an arm, and the estimate of the force on its hand."""
     arm, hand = (plant.GetModelInstanceByName(name) for name in (ARM, HAND))
     model, gripper = arm_model(robot)
     controller = builder.AddNamedSystem(
@@ -189,7 +189,8 @@ def drive_arm(
 
 
 def _robot_state(builder: DiagramBuilder, plant: MultibodyPlant) -> OutputPort:
-    """Joins the states of arm and hand: positions of joints and fingers, then velocities."""
+    """Concatenates the states of arm and hand: positions of joints and fingers, then their
+    velocities."""
     joined = builder.AddNamedSystem("robot_state", Multiplexer([JOINTS, FINGERS, JOINTS, FINGERS]))
     for index, (name, size) in enumerate(((ARM, JOINTS), (HAND, FINGERS))):
         halves = builder.AddNamedSystem(f"{name}_state", Demultiplexer([size, size]))

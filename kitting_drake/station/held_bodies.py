@@ -1,9 +1,9 @@
 """Corrects the positions of free bodies that an arm's hand carries along an arc.
 
 In each time step h, Drake advances a free body along a straight line, but the hand along the arc on
-which the joints move it. A held body therefore slides through the pads at h/2 times the centripetal
-acceleration of the hand: 20 mm/s at 5 m/s^2 and 1/128 s. A hand that moves on straight axes has no
-such arc.
+which the joints move it. A held body therefore slides through the pads with a speed of h/2 times
+the hand's centripetal acceleration, for example 20 mm/s at 5 m/s^2 and h = 1/128 s. The floating
+hand, which moves on straight axes, has no such arc.
 """
 
 from collections.abc import Sequence
@@ -17,23 +17,23 @@ from pydrake.systems.framework import Context
 from scipy.spatial.transform import Rotation
 
 _LEAST_RATE = 0.05
-"""If all joints are slower, nothing is corrected, in rad/s."""
+"""If all joints are slower than this, nothing is corrected, in rad/s."""
 _SAME_SPEED = 0.02
-"""A body moves with the hand if its velocity differs by less than this, in m/s, plus 5 %."""
+"""A body moves with the hand if their velocities differ by less than this, in m/s, plus 5 %."""
 
 
 class ArmPath:
-    """How an arm has moved its hand in the last time step."""
+    """Computes the arc on which an arm has moved its hand in the last time step."""
 
     def __init__(self, arm: MultibodyPlant, gripper: Frame, step: float) -> None:
         """
         Args:
-            arm: a plant of nothing but the arm and its hand.
+            arm: a plant that contains only the arm and its hand.
             gripper: a frame of the hand.
             step: the time step of the plant that is corrected, in s.
         """
         self._arm, self._gripper, self._step = arm, gripper, step
-        # Scratch memory: no value outlives the call that sets it.
+        # Scratch memory: each call overwrites the values before it reads them.
         self._scratch = arm.CreateDefaultContext()
 
     def correct(
@@ -46,10 +46,10 @@ class ArmPath:
         """Moves the bodies that the hand carries onto its arc. Call it once after each step.
 
         Args:
-            plant: discrete.
-            context: its context; modified.
+            plant: the plant, which must be discrete.
+            context: the plant's context; modified.
             state: (18) positions of the arm's joints and fingers, then their velocities.
-            bodies: free bodies; those that are locked or do not move with the hand stay.
+            bodies: free bodies. Those that are locked or do not move with the hand are not changed.
         """
         q, v = state[:9], state[9:]
         if not np.abs(v[:7]).max() > _LEAST_RATE:

@@ -13,13 +13,14 @@ from systems.signals import PixelGrid
 
 _YAWS = np.deg2rad([0.0, 45.0, 90.0, 135.0])
 _PLACES = 9
-"""Number of waiting positions to check along the workspace's y: the hand waits at any y."""
+"""Number of waiting positions to check along the workspace's y axis, because the hand may wait at
+any y."""
 
 
 def hidden_table_note(scenario: Scenario) -> str | None:
     """A warning if the waiting hand hides part of the workspace from a camera; else None.
 
-    The hidden part of o_t is a hole, unless another camera sees it.
+    Unless another camera sees the hidden part, it is a hole in o_t.
     """
     grid = scenario.heightmap.grid()
     p_WPoints = _waiting_hand(scenario.planner.home, grid)

@@ -1,9 +1,10 @@
 """Corrects the positions of free bodies that rotate while they are held.
 
 Drake advances the origin of a body's frame along a straight line in each time step. If the body
-rotates about a point at a distance r from that origin, it drifts outward by r (w h)^2 / 2 a step: a
-hammer held 45 mm from its frame's origin by a hand that turns at 2.5 rad/s slides through the pads
-by 1.1 mm in a second. By Newton's law it is the centre of mass that moves straight.
+rotates with angular velocity w about a point at a distance r from that origin, it drifts outward by
+r (w h)^2 / 2 in each step of length h. For example, a hammer that is held 45 mm from its frame's
+origin by a hand that turns at 2.5 rad/s slides through the pads by 1.1 mm in a second. By Newton's
+law it is the centre of mass, not the frame's origin, that should move straight.
 """
 
 from collections.abc import Sequence
@@ -16,17 +17,18 @@ from pydrake.multibody.tree import RigidBody
 from pydrake.systems.framework import Context
 
 _LEAST_RATE = 0.02
-"""Slower rotations are not corrected, in rad/s."""
+"""Rotations slower than this are not corrected, in rad/s."""
 
 
 def drift(
     rate: NDArray[np.float64], p_BoBcm: NDArray[np.float64], step: float
 ) -> NDArray[np.float64]:
-    """(3,) by how far a frame's origin has drifted from the centre of mass in a step, in metres.
+    """(3,) how far a frame's origin has drifted relative to the centre of mass in one step, in
+    metres.
 
     Args:
         rate: (3,) the body's angular velocity in rad/s, in the world.
-        p_BoBcm: (3,) the centre of mass from the origin in metres, in the world.
+        p_BoBcm: (3,) vector from the origin to the centre of mass, in the world, in metres.
         step: the time step, in s.
     """
     return 0.5 * step**2 * np.cross(rate, np.cross(rate, p_BoBcm))
@@ -36,9 +38,9 @@ def correct_drift(plant: MultibodyPlant, context: Context, bodies: Sequence[Rigi
     """Undoes the last time step's drift of free bodies. Call it once after each step.
 
     Args:
-        plant: discrete.
-        context: its context; modified.
-        bodies: free bodies; those that are locked or hardly rotate stay as they are.
+        plant: the plant, which must be discrete.
+        context: the plant's context; modified.
+        bodies: free bodies. Those that are locked or hardly rotate are not changed.
     """
     velocities = plant.GetVelocities(context)
     for body in bodies:

@@ -23,9 +23,9 @@ from kitting_drake.scenario.appearance import Appearance, Drawn, Fixed, Light, P
 from systems.sensor_noise import SHEEN_LABELS
 
 _COLOUR_STREAM, _LIGHT_STREAM = 11, 12
-"""Random streams of the seed, used by nothing else."""
+"""Numbers of this module's random streams, which NumPy gets together with the seed."""
 _STEEPEST_LIGHT = 0.35
-"""Least ratio of downward to horizontal component of a drawn light's direction."""
+"""Least ratio between the downward and the horizontal component of a drawn light's direction."""
 
 
 def paint_surfaces(
@@ -38,7 +38,7 @@ def paint_surfaces(
     """Paints the surfaces. Call it before cameras are added.
 
     Args:
-        plant: finalized.
+        plant: the finalized plant.
         scene_graph: the scene graph of the plant.
         appearance: the appearance of the scenario.
         groups: `table`, `fixtures/NAME` or `objects/NAME` for each body.
@@ -68,7 +68,8 @@ def paint_surfaces(
 
 
 def lights_of(appearance: Appearance, seed: int) -> list[LightParameter]:
-    """The lights of the cameras' renderer; if empty, Drake's default light at each camera."""
+    """The lights of the cameras' renderer. If there are none, Drake puts its default light at each
+    camera."""
     if appearance.drawn_lights is None:
         return [_light(item) for item in appearance.lights]
     rng = np.random.default_rng([seed, _LIGHT_STREAM])
@@ -128,7 +129,7 @@ def _colour(paint: Paint, own: Rgba, rng: np.random.Generator) -> Rgba:
     if isinstance(paint, Fixed):
         return Rgba(*paint.rgb)
     if paint.spread is None:
-        # HSV gives all hues, and as many grey and dark colours as others.
+        # Draw in HSV, which gives all hues, and also many grey and dark colours.
         return Rgba(*colorsys.hsv_to_rgb(*rng.uniform((0, 0, 0.12), (1, 1, 0.95))))
     near = np.array([own.r(), own.g(), own.b()]) + rng.uniform(-paint.spread, paint.spread, 3)
     return Rgba(*np.clip(near, 0.0, 1.0))
@@ -156,8 +157,8 @@ def _replace(
     role: Role,
     properties: PerceptionProperties | IllustrationProperties,
 ) -> None:
-    """Replaces properties. `AssignRole` alone cannot replace perception properties, and warns for
-    illustration properties."""
+    """Replaces the properties of a role. `AssignRole` alone cannot replace perception properties,
+    and prints a warning for illustration properties."""
     source = plant.get_source_id()
     scene_graph.RemoveRole(source, geometry, role)
     scene_graph.AssignRole(source, geometry, properties)

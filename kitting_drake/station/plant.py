@@ -1,4 +1,5 @@
-"""Builds the station's plant: table, fixtures and objects; see `robot` for the robot."""
+"""Builds the station's plant with table, fixtures and objects. The module `robot` adds the
+robot."""
 
 from pathlib import Path
 
@@ -21,7 +22,7 @@ from systems.rest_detector import BoundedBody, Box
 _X_WTABLE = RigidTransform([0.5, 0.0, 0.0])
 
 _VARIATION_STREAM = 13
-"""Random stream of the seed, used by nothing else."""
+"""Number of this module's random stream, which NumPy gets together with the seed."""
 
 
 def add_plant(builder: DiagramBuilder, scenario: Scenario) -> tuple[MultibodyPlant, SceneGraph]:
@@ -37,7 +38,7 @@ def add_models(
     Args:
         plant: not finalized yet.
         scene: the scene of the episode.
-        variation: ranges of friction and mass.
+        variation: ranges of the random variation of friction and mass.
         seed: the seed of the draws.
 
     Returns:
@@ -47,7 +48,7 @@ def add_models(
         UserError: a model cannot be loaded, or does not have exactly one link.
     """
     parser = Parser(plant)
-    # A model may occur several times.
+    # Allow a model to occur several times.
     parser.SetAutoRenaming(True)
     parser.package_map().AddPackageXml(str(MODELS / "package.xml"))
     rng = np.random.default_rng([seed, _VARIATION_STREAM])
@@ -67,7 +68,7 @@ def add_models(
     objects = []
     for item in scene.objects:
         body = add(item.model)
-        # A copy: a view would keep the plant in memory.
+        # Make a copy, because a view would keep the plant in memory.
         com = np.array(body.default_com())
         objects.append(
             PlacedObject(
@@ -104,13 +105,13 @@ def _add_body(
 def set_initial_poses(
     plant: MultibodyPlant, scene: Scene, objects: tuple[PlacedObject, ...]
 ) -> None:
-    """Sets the default poses of the objects: those of the scene."""
+    """Sets the default poses of the objects to the initial poses of the scene."""
     for placed, item in zip(objects, scene.objects, strict=True):
         plant.SetDefaultFloatingBaseBodyPose(plant.get_body(placed.body), item.X_WB)
 
 
 def bounded_body(plant: MultibodyPlant, scene_graph: SceneGraph, body: RigidBody) -> BoundedBody:
-    """A body with the boxes around its collision geometry."""
+    """Computes the boxes around a body's collision geometry."""
     inspector = scene_graph.model_inspector()
     boxes = []
     for geometry in plant.GetCollisionGeometriesForBody(body):

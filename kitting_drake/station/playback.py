@@ -24,14 +24,15 @@ from systems.trajectory_source import TrajectorySource
 
 @dataclass(frozen=True)
 class Playback:
-    """What the plant did, after each of its n steps. In SI units and radians."""
+    """The recorded motion of the plant after each of its n steps, in SI units and radians."""
 
     time: NDArray[np.float64]
-    """(n)."""
+    """(n) times since the start, in s."""
     commanded: NDArray[np.float64]
-    """(n, 21) positions, velocities and accelerations of the joints, from the trajectory."""
+    """(n, 21) commanded positions, velocities and accelerations of the joints, from the
+    trajectory."""
     position: NDArray[np.float64]
-    """(n, 7) of the joints. Likewise their velocities and torques."""
+    """(n, 7) positions of the joints. `velocity` and `torque` hold their velocities and torques."""
     velocity: NDArray[np.float64]
     torque: NDArray[np.float64]
     object_poses: tuple[RigidTransform, ...]
@@ -46,19 +47,19 @@ def play_trajectory(
     base: Path | None = None,
     seconds: float | None = None,
 ) -> Playback:
-    """Plays a trajectory back, into the same controller and plant as the station's.
+    """Plays a trajectory back with the controller and plant of a station.
 
-    Nothing stops it: guarded segments go on to their end.
+    Contacts do not stop the trajectory: segments with a `stop_force` continue to their end.
 
     Args:
-        scenario: with the arm for which the trajectory was planned.
-        trajectory: begins at time zero, where the arm then is.
-        seed: of the scene.
-        base: base folder of the scenario's relative paths; None: the working directory.
-        seconds: simulated time; None: until 0.2 s after the end.
+        scenario: a scenario with the arm for which the trajectory was planned.
+        trajectory: the trajectory. The arm is at its first point at time zero.
+        seed: seed of the scene.
+        base: base folder of the scenario's relative paths; None for the working directory.
+        seconds: simulated time; None stands for 0.2 s after the trajectory's end.
 
     Raises:
-        UserError: the scenario's robot is no arm.
+        UserError: the scenario's robot is not an arm.
     """
     robot = scenario.robot
     if not isinstance(robot, FrankaArm):

@@ -1,4 +1,4 @@
-"""Connects a policy to a station: the scenario's own, or any LeafSystem."""
+"""Connects a policy to a station, either the scenario's policy or any LeafSystem."""
 
 from pydrake.systems.framework import Diagram, DiagramBuilder, System
 
@@ -12,8 +12,9 @@ def make_policy(station: KittingStation, observer: DecisionObserver | None = Non
     """Makes the policy system of the station's scenario.
 
     Args:
-        station: the station that the policy will be connected to.
-        observer: called with every decision of a learned policy and its observation.
+        station: the station to which the policy will be connected.
+        observer: if given, a function that is called with every decision of a learned policy and
+            its observation.
 
     Raises:
         UserError: the policy cannot be made.
@@ -46,10 +47,11 @@ def connect_policy(
     the policy's output port `action` to the station's input port.
 
     Args:
-        builder: contains both.
+        builder: the builder that contains station and policy.
         station: the station.
-        policy: its policy.
-        through: a system with input and output port `action`, inserted after the policy.
+        policy: the policy.
+        through: a system with an input port and an output port `action`, which is inserted after
+            the policy.
 
     Raises:
         UserError: the policy needs images, but the scenario has no cameras.
@@ -71,7 +73,7 @@ def connect_policy(
 
 
 def with_policy(station: KittingStation, observer: DecisionObserver | None = None) -> Diagram:
-    """A Diagram of a station and its scenario's policy, connected; see `make_policy`."""
+    """Builds a Diagram of a station and its scenario's policy, connected; see `make_policy`."""
     builder = DiagramBuilder()
     builder.AddNamedSystem("station", station)
     policy = builder.AddNamedSystem("policy", make_policy(station, observer))

@@ -26,21 +26,21 @@ from systems.hand_geometry import FINGERTIP_DISTANCE
 from systems.robot_motion import RobotMotion
 
 HAND, ARM = "franka_hand", "franka_arm"
-"""Names of the model instances."""
+"""Names of the model instances of the hand and of the arm."""
 HAND_JOINT_NAMES = ("x", "y", "z", "yaw")
 ARM_JOINT_NAMES = tuple(f"joint{number}" for number in range(1, 8))
 FINGER_NAMES = ("left_finger_slide", "right_finger_slide")
 GRIPPER = "gripper"
-"""Name of the frame G of an `arm_model`, see `systems.hand_geometry`."""
+"""Name of the gripper frame G of an `arm_model`, see `systems.hand_geometry`."""
 
 _X_FLANGEHAND = RigidTransform(RollPitchYaw(0, 0, -math.pi / 4), [0, 0, 0])
 _X_HANDG = RigidTransform(RollPitchYaw(math.pi, 0, 0), [0, 0, FINGERTIP_DISTANCE])
 _FLOOR = -0.75
-"""Height of the floor below the table, in m."""
+"""World z of the floor below the table, in m."""
 _PEDESTAL = (0.26, 0.22)
 """Extents of an arm's pedestal along its x and y, in m; its foot is 0.23 x 0.19 m."""
 _PEDESTAL_MIDDLE = -0.04
-"""Where the middle of the foot is, along the base's x, in m."""
+"""Position of the middle of the foot along the base's x axis, in m."""
 
 
 def joint_names(robot: Robot) -> tuple[str, ...]:
@@ -58,7 +58,7 @@ def add_robot(plant: MultibodyPlant, robot: Robot) -> None:
     _add_arm(parser, plant, robot)
     _add_pedestal(plant, robot)
     arm = plant.GetModelInstanceByName(ARM)
-    # A Franka compensates the weight of itself and of its hand.
+    # A Franka compensates its own weight and that of its hand, so switch off gravity for both.
     for instance in (arm, plant.GetModelInstanceByName(HAND)):
         plant.set_gravity_enabled(instance, False)
     for name, stiffness, damping, friction in zip(
@@ -71,7 +71,8 @@ def add_robot(plant: MultibodyPlant, robot: Robot) -> None:
 
 
 def arm_model(robot: FrankaArm) -> tuple[MultibodyPlant, Frame]:
-    """A plant of nothing but the arm and its hand, without gravity, and its frame G."""
+    """Makes a plant that contains only the arm and its hand, without gravity. Returns it and its
+    gripper frame G."""
     plant = MultibodyPlant(time_step=0.0)
     _add_arm(_parser(plant), plant, robot)
     hand = plant.GetFrameByName("hand")
@@ -82,7 +83,7 @@ def arm_model(robot: FrankaArm) -> tuple[MultibodyPlant, Frame]:
 
 
 def make_motion(scenario: Scenario) -> RobotMotion:
-    """What moves the robot's joints.
+    """Makes the object that computes the motions of the robot.
 
     Raises:
         UserError: an arm cannot reach the home pose.
@@ -103,11 +104,11 @@ def make_motion(scenario: Scenario) -> RobotMotion:
 
 
 def set_home(plant: MultibodyPlant, motion: RobotMotion, opening: float) -> None:
-    """Sets the plant's default positions of the robot: at home, with open jaws.
+    """Sets the plant's default positions so that the robot is at home with open jaws.
 
     Args:
-        plant: finalized.
-        motion: the robot's.
+        plant: the finalized plant.
+        motion: computes the robot's motions.
         opening: the distance between the pads, in m.
     """
     names = ARM_JOINT_NAMES if plant.HasModelInstanceNamed(ARM) else HAND_JOINT_NAMES
@@ -119,7 +120,7 @@ def set_home(plant: MultibodyPlant, motion: RobotMotion, opening: float) -> None
 
 
 def _base_pose(robot: FrankaArm) -> RigidTransform:
-    """X_WB of the arm's base."""
+    """Pose X_WB of the arm's base in the world."""
     base = robot.arm_base()
     return RigidTransform(RollPitchYaw(0, 0, base.yaw), [base.x, base.y, base.z])
 
@@ -134,8 +135,8 @@ def _add_arm(parser: Parser, plant: MultibodyPlant, robot: FrankaArm) -> None:
 
 
 def _add_pedestal(plant: MultibodyPlant, robot: FrankaArm) -> None:
-    """Draws what the arm stands on, from the floor up to its base."""
-    # Just below the base, so that the table covers it.
+    """Adds a visual pedestal for the arm, from the floor up to its base."""
+    # End just below the base, so that the table covers the pedestal.
     height = robot.base[2] - 0.001 - _FLOOR
     if height <= 0:
         return

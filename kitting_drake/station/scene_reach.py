@@ -1,4 +1,4 @@
-"""Whether an arm reaches the objects and goals of a scene."""
+"""Checks whether an arm reaches the objects and goals of a scene."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from systems.signals import PlanarPose, SurfaceHeights
 
 
 def check_scene_reach(scene: Scene, motion: RobotMotion, parameters: PickPlaceParameters) -> None:
-    """Fails early if an arm could not do anything in a scene. A floating hand reaches everything.
+    """Raises an error if an arm cannot do anything in a scene. A floating hand reaches everything.
 
-    An object or a goal that alone is out of reach is no error: its action is refused during the
-    episode.
+    If only some objects or goals are out of reach, there is no error here. Actions on them are
+    refused during the episode.
 
     Raises:
         UserError: all objects that can fill a goal are out of reach, or all goals.
@@ -80,7 +80,8 @@ def _goal_problems(
 
 
 def _first_problem(stops: Iterable[HandStop], motion: ArmMotion) -> str:
-    """Empty if any of the stops can be reached, or if there are none."""
+    """Says why the first stop cannot be reached; empty if any of the stops can be reached, or if
+    there are none."""
     first = ""
     for stop in stops:
         problem = reach_problem(motion.postures, [stop])
@@ -97,7 +98,7 @@ def _stops(
     scene: Scene,
     parameters: PickPlaceParameters,
 ) -> Iterable[HandStop]:
-    """Where the hand goes down, for each grasp of an object at a pose."""
+    """Yields the place at which the hand goes down, for each grasp of an object at a pose."""
     highest = _highest(scene)
     bottom = float(X_WB.translation()[2])
     for grasp in item.grasps:
@@ -117,7 +118,8 @@ def _stops(
 
 
 def _highest(scene: Scene) -> float:
-    """The highest point of fixtures with cavities, and of the objects that are present."""
+    """World z of the highest point of fixtures with cavities and of the objects that are present,
+    in m."""
     late = () if scene.arrivals is None else scene.arrivals.objects
     tops = [
         float((item.X_WB @ item.p_BPoints.T)[2].max())

@@ -20,13 +20,13 @@ _IMAGES = {
     "depth_image_32f": "depth_image",
     "body_pose_in_world": "body_pose_in_world",
 }
-"""Output ports of a camera, and the prefixes of the projector's input ports."""
+"""For each output port of a camera, the prefix of the projector's input port."""
 _EXPORTED = {
     "color_image": "color_image",
     "depth_image_32f": "depth_image",
     "body_pose_in_world": "camera_pose",
 }
-"""Output ports of a camera, and the prefixes of the station's output ports."""
+"""For each output port of a camera, the prefix of the station's output port."""
 
 
 def add_cameras(

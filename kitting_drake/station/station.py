@@ -1,4 +1,4 @@
-"""The station: a Diagram of everything but the policy."""
+"""The station: a Diagram of the whole robot cell, without the policy."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -87,34 +87,38 @@ class KittingStation(Diagram):
         - depth_image_<camera>
         - camera_pose_<camera>
 
-    - `action` (abstract, `PickPlaceAction`): evaluated only when the planner needs an action.
+    - `action` (abstract, `PickPlaceAction`): the next action. The port is evaluated only when the
+      planner needs an action.
     - `desired_motion` (12 or 21), `desired_opening` (2), `closing_force` (1): the controller's
-      inputs, see `TrajectoryController`. They replace the planner's commands.
+      inputs, which replace the planner's commands; see `TrajectoryController`.
     - `observation` (abstract, `Observation`): o_t. `observation_heights`: o_t without colours;
       evaluating it renders no colour images. These and the camera ports exist only if the scenario
       has cameras and the machine can render.
     - `failed_picks`, `history`, `peak_force`, `accepted_action`, `asks`, `mode`, `counts`: the
-      `PickPlacePlanner`'s.
-    - `robot_state` (12 or 18): positions, then velocities of the joints and both fingers; m, rad,
-      s. The floating hand's joints are x, y, z, yaw; an arm has seven.
-    - `hand_state` (12): the same for x, y, z, yaw and both fingers, whatever moves the hand.
-    - `wrist_force` (6): contact forces on x, y, z (N), about z (N m), and on each finger (N). An
-      arm computes them from its joint torques: `WristForce`.
-    - `actuation` (6 or 9): actuation of the joints (N, N m) and of each finger (N). An arm's is
-      that of the last step.
-    - `commanded` (12 or 21): q_d, v_d, a_d of the joints. `commanded_opening` (2): the opening
-      between the pads in m, and its rate. `commanded_closing_force` (1): of each pad, in N.
-    - `body_poses`, `contact_results`: the plant's. `query_object`: the scene graph's.
-    - `at_rest` (n): the `RestDetector`'s; 1 for an object at rest.
-    - `placements` to `height_error`: the `PlacementMonitor`'s.
-    - `color_image_<camera>`, `depth_image_<camera>`, `camera_pose_<camera>`: the projector's
-      inputs: images with noise, and the calibrated X_WB.
+      ports of the `PickPlacePlanner` of these names.
+    - `robot_state` (12 or 18): positions, then velocities, of the joints and both fingers, in m,
+      rad and s. The floating hand's joints are x, y, z, yaw; an arm has seven joints.
+    - `hand_state` (12): positions, then velocities, of x, y, z, yaw and both fingers, for any
+      robot.
+    - `wrist_force` (6): contact forces along x, y, z (N), the moment about z (N m), and the force
+      on each finger (N). For an arm, `WristForce` computes them from its joint torques.
+    - `actuation` (6 or 9): actuation of the joints (N, N m) and of each finger (N). For an arm it
+      is that of the last step.
+    - `commanded` (12 or 21): desired positions q_d, velocities v_d and accelerations a_d of the
+      joints. `commanded_opening` (2): the desired opening between the pads in m, and its rate in
+      m/s. `commanded_closing_force` (1): the closing force of each pad, in N.
+    - `body_poses`, `contact_results`: the plant's ports of these names. `query_object`: the scene
+      graph's port `query`.
+    - `at_rest` (n): 1 for an object at rest, else 0; see `RestDetector`.
+    - `placements` to `height_error`: the ports of the `PlacementMonitor` of these names.
+    - `color_image_<camera>`, `depth_image_<camera>`, `camera_pose_<camera>`: images with noise, and
+      the calibrated pose X_WB of the camera; the observation is computed from them.
 
     All state is in the Context. Ports compute only on demand; in particular, images are rendered
     only when an observation is evaluated.
 
-    Simulate the station with `make_simulator`. It lets objects sleep when at rest, and appear
-    during the episode.
+    Simulate the station with `make_simulator`. It lets objects appear during the episode, and
+    freezes objects at rest.
     """
 
     def __init__(
@@ -132,8 +136,9 @@ class KittingStation(Diagram):
         self.objects, self.still_bodies = add_models(
             self.plant, self.scene, scenario.variation, seed
         )
-        """The scene's objects with their bodies, and the bodies of table and fixtures. Held as
-        indices: a body would keep the plant, and with it the station, alive forever."""
+        """The scene's objects with their bodies, and the bodies of table and fixtures. They are
+        stored as indices, because a body would keep the plant, and so the station, alive
+        forever."""
         add_robot(self.plant, scenario.robot)
         self.plant.Finalize()
         set_initial_poses(self.plant, self.scene, self.objects)
@@ -216,7 +221,7 @@ class KittingStation(Diagram):
         builder.Connect(self.plant.get_body_poses_output_port(), feeder.GetInputPort("body_poses"))
         return feeder
 
-    # Values of the ports, for callers that hold the context of an enclosing Diagram.
+    # Methods that evaluate the ports, for callers that hold the context of an enclosing Diagram.
 
     def object_poses(self, root_context: Context) -> list[RigidTransform]:
         """X_WB of each of the scene's objects."""
@@ -224,7 +229,7 @@ class KittingStation(Diagram):
         return [body.EvalPoseInWorld(context) for body in self._bodies]
 
     def placements(self, root_context: Context) -> list[Placement]:
-        """The port `placements`: one for each of the scene's objects."""
+        """The port `placements`: a placement for each of the scene's objects."""
         return self._monitor.placements(self._monitor.GetMyContextFromRoot(root_context))
 
     def reward(self, root_context: Context) -> float:
@@ -236,11 +241,11 @@ class KittingStation(Diagram):
         return frozenset(np.flatnonzero(self._eval(root_context, "kept_goals")).tolist())
 
     def at_rest(self, root_context: Context) -> NDArray[np.bool_]:
-        """(n,) which of the scene's objects are at rest: the port `at_rest`."""
+        """The port `at_rest`: (n,) whether each of the scene's objects is at rest."""
         return self._rest_detector.at_rest(self._rest_detector.GetMyContextFromRoot(root_context))
 
     def mode(self, root_context: Context) -> Mode:
-        """The port `mode`."""
+        """The port `mode`: the planner's present mode."""
         return Mode(int(self._eval(root_context, "mode")[0]))
 
     def asks(self, root_context: Context) -> bool:
@@ -257,7 +262,8 @@ class KittingStation(Diagram):
         return actions, missed, dropped, stopped
 
     def peak_force(self, root_context: Context) -> tuple[float, float, Mode]:
-        """The port `peak_force`: vertical and lateral in N, and the mode of the larger one."""
+        """The port `peak_force`: the largest vertical and lateral contact force in N, and the mode
+        in which the larger of the two occurred."""
         vertical, lateral, mode = self._eval(root_context, "peak_force").tolist()
         return vertical, lateral, Mode(int(mode))
 
@@ -270,7 +276,8 @@ class KittingStation(Diagram):
         return self.GetInputPort("action").Eval(self.GetMyContextFromRoot(root_context))
 
     def accepted_action(self, root_context: Context) -> PickPlaceAction:
-        """The port `accepted_action`: the last action begun, or the stop."""
+        """The port `accepted_action`: the action that began last or, after a stop, the stopping
+        action."""
         return self._eval(root_context, "accepted_action")
 
     def _eval(self, root_context: Context, port: str) -> Any:
@@ -281,21 +288,22 @@ class KittingStation(Diagram):
         """Pose of a camera that sees the whole cell."""
         return X_WOVERVIEW if self._arm_path is None else X_WARM_OVERVIEW
 
-    # Sleep.
+    # Simulation, with objects that appear or sleep.
 
     def make_simulator(
         self, diagram: Diagram | None = None, *, monitor: Monitor | None = None
     ) -> Simulator:
-        """Makes a Simulator in which objects appear (see `ObjectFeeder`) and, if the scenario
-        enables it, sleep (see `RestDetector`).
+        """Makes a Simulator in which objects appear (see `ObjectFeeder`). If the scenario enables
+        sleep, objects at rest are frozen (see `RestDetector`).
 
         Args:
-            diagram: the outermost Diagram, which contains this station; None: the station alone.
-            monitor: called after each step. Use it instead of `Simulator.set_monitor`, which would
-                disable appearing and sleep.
+            diagram: the outermost Diagram, which contains this station; None if it is the station
+                itself.
+            monitor: a function that is called after each step. Use it instead of
+                `Simulator.set_monitor`, which would prevent that objects appear and sleep.
 
         Raises:
-            ValueError: `diagram` is missing, but the station is part of one.
+            ValueError: `diagram` is None, but the station is part of a Diagram.
         """
         if diagram is None and self.GetSystemPathname().strip(":").count("::"):
             raise ValueError("make_simulator needs the outermost Diagram that contains the station")
@@ -305,30 +313,33 @@ class KittingStation(Diagram):
             self._let_appear(root_context)
             self._apply_sleep(root_context)
             status = EventStatus.DidNothing() if monitor is None else monitor(root_context)
-            # Last, so that the monitor sees the bodies where the planner's update saw them.
+            # Correct the drift last, so that the monitor sees the bodies where the planner's update
+            # saw them.
             self._correct_drift(root_context)
             return status
 
         simulator.set_monitor(step)
         return simulator
 
-    # The simulator's monitor calls these three, because a LeafSystem cannot change the context of
-    # another system.
+    # The simulator's monitor calls the next three methods, because a LeafSystem cannot change the
+    # context of another system.
 
     def _correct_drift(self, root_context: Context) -> None:
         """Calls `correct_drift` if the plant has just made a step."""
         step = self.plant.time_step()
-        # Times of steps are rounded unless the step is a binary fraction.
+        # Allow for rounding errors in the times of steps, which are exact only if the step is a
+        # binary fraction.
         if abs(math.remainder(root_context.get_time(), step)) < 1e-6 * step:
             context = self.plant.GetMyMutableContextFromRoot(root_context)
             correct_drift(self.plant, context, self._bodies)
             if self._arm_path is not None:
-                # The port `robot_state`, evaluated here, would keep the Diagram alive forever.
+                # Do not evaluate the port `robot_state` here: that would keep the Diagram alive
+                # forever.
                 state = robot_state(self.plant, context)
                 self._arm_path.correct(self.plant, context, state, self._bodies)
 
     def _let_appear(self, root_context: Context) -> None:
-        """Moves the next object to its place of appearance, if one is to appear; it wakes there."""
+        """If an object is to appear, moves it to its place of appearance and wakes it."""
         if self._feeder is None:
             return
         port = self._feeder.get_output_port()
@@ -344,8 +355,8 @@ class KittingStation(Diagram):
         """Freezes objects at rest and thaws the others.
 
         A frozen object's joint is locked. Its contact with table, fixtures and other frozen objects
-        is filtered, but awake bodies still collide with it. If sleep is disabled, only objects that
-        have not appeared are frozen.
+        is filtered out, but bodies that are not frozen still collide with it. If sleep is disabled,
+        only objects that have not appeared are frozen.
         """
         may_sleep = self.at_rest(root_context)
         if not self.scenario.sleep.enabled:
@@ -366,7 +377,8 @@ class KittingStation(Diagram):
             self.scene_graph.GetMyMutableContextFromRoot(root_context)
         )
         still = [self.plant.get_body(index) for index in self.still_bodies]
-        # Wake first, which allows all contacts; then freeze, which filters some.
+        # Thaw objects first, which allows all their contacts; then freeze others, which filters
+        # some contacts.
         for body, resting in sorted(changed, key=lambda change: change[1]):
             own = self._geometry([body])
             if resting:
@@ -401,10 +413,10 @@ def build_station(
     """Builds the station of a scenario.
 
     Args:
-        scenario: what to build, except for its policy (see `station.policy`).
+        scenario: the scenario. Its policy is not part of the station (see `station.policy`).
         seed: the seed of the scene and of all noise; see `TaskConfig.make_scene`.
-        base: base folder of the scenario's relative paths; None: the working directory.
-        takes_joint_targets: whether the caller commands the joints, in place of the planner.
+        base: base folder of the scenario's relative paths; None for the working directory.
+        takes_joint_targets: whether the caller commands the joints instead of the planner.
 
     Raises:
         UserError: the scenario is invalid.

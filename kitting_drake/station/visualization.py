@@ -56,14 +56,15 @@ def start_meshcat(parameters: MeshcatParams) -> Meshcat:
     meshcat.SetProperty("/Grid", "visible", False)
     meshcat.SetProperty("/Axes", "visible", False)
     _add_room(meshcat)
-    # From farther away, a narrow view fills the page with the workspace and distorts it little.
+    # A narrow field of view from farther away shows the workspace large and with little distortion.
     meshcat.SetProperty("/Cameras/default/rotated/<object>", "fov", _FIELD_OF_VIEW_DEG)
     meshcat.SetCameraPose(camera_in_world=[1.55, -0.42, 0.98], target_in_world=[0.47, -0.02, 0.09])
     return meshcat
 
 
 def _add_room(meshcat: Meshcat) -> None:
-    """Adds a floor, and legs to the table. They are in Meshcat alone: no camera sees them."""
+    """Adds a floor, and legs to the table. They are only in Meshcat, so no simulated camera sees
+    them."""
     top, floor = -0.07, -0.75
     meshcat.SetObject("/room/floor", Cylinder(5.0, 0.02), Rgba(0.80, 0.72, 0.62))
     meshcat.SetTransform("/room/floor", RigidTransform([0.5, 0.0, floor - 0.01]))
@@ -87,9 +88,9 @@ def add_video(builder: DiagramBuilder, station: KittingStation, path: Path) -> "
     """Adds a camera that sees the whole station, and a writer of its video.
 
     Args:
-        builder: contains the station, for which no context exists yet.
+        builder: the builder that contains the station. No context may exist yet.
         station: the station to record.
-        path: a .gif or .webp file, written by the writer's `Save()`.
+        path: path of a .gif or .webp file, which the writer's `Save()` writes.
 
     Raises:
         MachineError: this machine cannot render.

@@ -140,7 +140,7 @@ def draw_poses(
     Args:
         footprints: the footprints of what to place, in drawing order; put large ones first.
         grid: the workspace.
-        rng: the random generator of all draws.
+        rng: the generator of all random draws.
         spacing: least distance between two bodies, in metres.
 
     Returns:

@@ -662,7 +662,7 @@ def test_other_images_are_another_run(folder: Path, tmp_path: Path, refused: Cal
 
 def test_a_folder_in_use_is_refused(demos: Path, folder: Path, refused: Callable[..., str]):
     with alone_in(folder):
-        assert f"another process is at work in {folder}" in refused(demos, folder)
+        assert f"another process is writing to {folder}" in refused(demos, folder)
 
 
 @pytest.mark.parametrize("content", [b"", b"not a checkpoint", "half", "foreign", "other networks"])

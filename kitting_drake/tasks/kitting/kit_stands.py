@@ -123,7 +123,7 @@ def draw_stand(riser: list[float], tilt_deg: list[float], rng: np.random.Generat
     Args:
         riser: least and greatest height, in metres.
         tilt_deg: least and greatest tilt, in degrees.
-        rng: the random generator of all draws.
+        rng: the generator of all random draws.
     """
     height = float(rng.uniform(riser[0], riser[1]))
     tilt, direction = (

@@ -64,7 +64,7 @@ def start_groups(
         kit: the kit.
         tools: the tools; each is a member of one group.
         kind: one of `START_KINDS`.
-        rng: the random generator of all draws.
+        rng: the generator of all random draws.
     """
     block = Group({KIT: RigidTransform()}, CrossSection.square(kit.size[:2], True))
     return [*GROUPS[kind](block, kit, tools, rng)]
@@ -172,7 +172,7 @@ def _lean(kit: Kit, tool: Tool, side: int, rng: np.random.Generator) -> RigidTra
         kit: the kit.
         tool: the tool.
         side: the side's normal is x of K, turned by so many quarter turns.
-        rng: the random generator of all draws.
+        rng: the generator of all random draws.
     """
     length, width, height = kit.size
     half, other_half = (length / 2, width / 2) if side % 2 == 0 else (width / 2, length / 2)

@@ -90,7 +90,7 @@ def draw_start(
         grid: the workspace.
         spacing: least distance between groups of tools, and to the kit, in metres.
         yaw_range_deg: rotations are drawn within plus or minus this, in degrees.
-        rng: the random generator of all draws.
+        rng: the generator of all random draws.
         kit_model: whether the kit's block is its model; else a box without cavities.
 
     Raises:

@@ -141,7 +141,7 @@ def draw_kit_poses(
         grid: the workspace.
         spacing: least distance between any two, in metres.
         yaw_range_deg: rotations are drawn within plus or minus this, in degrees.
-        rng: the random generator of all draws.
+        rng: the generator of all random draws.
         margins: how far each kit reaches beyond its outline because it is tilted, in metres; by
             default not at all.
 
@@ -244,9 +244,9 @@ def draw_boxes(
         count: largest number.
         kits: the kits and their poses.
         tools: the tools.
-        X_WTools: their poses.
+        X_WTools: the poses of the tools in the world.
         grid: the workspace.
-        rng: the random generator of all draws.
+        rng: the generator of all random draws.
     """
     room = _rectangle((grid.x_min, grid.y_min), (grid.x_max, grid.y_max)) ^ _rectangle(*TABLE)
     placed = [

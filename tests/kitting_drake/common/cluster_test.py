@@ -159,7 +159,7 @@ def test_an_error_names_a_node_that_lacks_something(
     (tmp_path / "file").touch()
     call = ("kitting_drake.common.files", "require_folder", (tmp_path / "file" / "folder",))
     outcome = pickle.loads(cluster._answer(versions(), pickle.dumps(call)))
-    assert outcome.reason.startswith("the node second cannot work: cannot write into ")
+    assert outcome.reason.startswith("the node second cannot run the work: cannot write into ")
 
 
 def test_a_function_of_the_main_module_is_importable(monkeypatch: pytest.MonkeyPatch):

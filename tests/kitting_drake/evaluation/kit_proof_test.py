@@ -20,12 +20,12 @@ def proof(clearance_mm: float, *kitted: int) -> KitProof:
 
 def test_the_verdict_names_the_trouble_and_the_cure():
     assert _verdict(proof(0.35, 10, 10), []) == (
-        "It fits: 20 of 20 tools were kitted at 0.35 mm a side, with at most 12 N."
+        "The kit fits: 20 of 20 tools were kitted at 0.35 mm a side, with at most 12 N."
     )
     bad = _verdict(proof(0.15, 4, 10), [proof(0.35, 6, 10), proof(0.55, 10, 10)])
-    assert "the trouble is hammer (6 of 10, mostly insertion blocked)" in bad
-    assert "0.55 mm would mend it: 20 of 20" in bad
-    assert "does not mend it" in _verdict(proof(0.15, 4, 10), [proof(0.35, 6, 10)])
+    assert "the worst tool is hammer (6 of 10 failed, mostly insertion blocked)" in bad
+    assert "0.55 mm would be enough: 20 of 20" in bad
+    assert "is not enough either" in _verdict(proof(0.15, 4, 10), [proof(0.35, 6, 10)])
 
 
 @pytest.mark.slow
@@ -34,7 +34,7 @@ def test_a_kit_is_proved_and_can_be_made_again(tmp_path: Path):
     export_kit(request)
     seen: list[tuple[int, int]] = []
     verdict = prove_kit(tmp_path / "kit", 1, lambda _, done, total: seen.append((done, total)))
-    assert verdict.startswith("It fits: 1 of 1 tools")
+    assert verdict.startswith("The kit fits: 1 of 1 tools")
     assert seen == [(0, 1), (1, 1)]
     page = (tmp_path / "kit" / "proof.html").read_text()
     assert verdict in page and page.count("data:image/png") == 3
