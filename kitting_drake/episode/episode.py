@@ -153,7 +153,7 @@ class Episode:
             diagram: the outermost Diagram; with `pauses` it may be the station alone.
             pauses: whether `advance` returns each time the planner needs an action.
 
-            The other arguments are those of `run_episode`.
+        The other arguments are those of `run_episode`.
         """
         self._station = station
         self._names = {"scenario": scenario, "policy": policy, "seed": station.seed}

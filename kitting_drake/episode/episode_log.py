@@ -33,7 +33,7 @@ def add_log_flag(parser: argparse.ArgumentParser) -> None:
         "--log",
         type=Path,
         metavar="FILE.npz",
-        help="also log joints, forces, o_t and actions (.npz, or .mcap for Foxglove and rerun)",
+        help="also log joints, forces, heightmaps, actions (.npz, or .mcap for Foxglove, rerun)",
     )
 
 

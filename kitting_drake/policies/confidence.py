@@ -71,7 +71,9 @@ def _read(path: Path, policy: str) -> Reliability:
         record: dict[str, Any] = json.loads(path.read_text())[policy]
         return Reliability(record["weights"], record["threshold"])
     except (OSError, ValueError, LookupError, TypeError) as error:
-        raise UserError(f"{path} does not hold the regression of {policy}: {error}") from error
+        raise UserError(
+            f"{path} has no valid regression for the policy {policy}: {error}"
+        ) from error
 
 
 def evidence_of_networks(observation: Observation, decision: Decision) -> Evidence:

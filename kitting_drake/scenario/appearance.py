@@ -18,12 +18,12 @@ class Fixed:
 
 @dc.dataclass
 class Drawn:
-    """A colour drawn from the seed."""
+    """A random colour that the episode's seed determines."""
 
-    # True: all surfaces that match the pattern get the same colour. False: each gets its own.
+    # Whether all surfaces that match the pattern get the same colour. If not, each gets its own.
     shared: bool = False
 
-    # Largest deviation of each channel from the model's own colour. null: any colour.
+    # Largest deviation of each channel from the model's own colour, 0 to 1. null allows any colour.
     spread: float | None = bounded(None, 0.0, 1.0)
 
 
@@ -34,10 +34,10 @@ Paint = Fixed | Drawn
 class Light:
     """A directional light."""
 
-    # Direction of its rays in the world.
+    # Direction of the light's rays in the world.
     direction: list[float] = bounded([0.0, 0.0, -1.0], -1.0, 1.0)
 
-    # Brightness; a light of 1 lights a surface fully.
+    # Brightness. At 1 a surface that faces the light shows its full colour.
     intensity: float = bounded(1.0, 0.0, 10.0)
 
     # Red, green and blue, 0 to 1.
@@ -46,29 +46,31 @@ class Light:
 
 @dc.dataclass
 class Appearance:
-    """Colours, sheen and lights. By default the models' own colours, lit from each camera."""
+    """Colours, sheen and lights of a scene. By default, models have their own colours and a light
+    is at each camera."""
 
-    # Paints by pattern. A pattern matches surfaces named table/PART, fixtures/NAME/PART or
-    # objects/NAME/PART; PART is a visual of the SDFormat model, and * matches any text. For
-    # example, "fixtures/kit/*" paints the kit: its parts are block and cavities. If several
-    # patterns match a surface, the last one wins.
+    # Colours by pattern. Surfaces are named table/PART, fixtures/NAME/PART or objects/NAME/PART,
+    # where PART is a visual of the SDFormat model. In a pattern, * matches any text. For example,
+    # "fixtures/kit/*" paints the kit, whose parts are block and cavities. If several patterns match
+    # a surface, the last one wins.
     paints: dict[str, Paint] = dc.field(default_factory=dict)
 
-    # The share, 0 to 1, of a surface's pixels that have no depth. The keys are patterns as above.
+    # The share, 0 to 1, of a surface's pixels that have no depth, by pattern as for paints.
     sheen: dict[str, float] = dc.field(default_factory=dict)
 
-    # If empty, a light at each camera.
+    # The lights. If there are none, a light is at each camera.
     lights: list[Light] = dc.field(default_factory=list)
 
-    # If given, one to three lights drawn from the seed replace these. Their total brightness is
-    # between 1 - value and 1 + value times normal.
+    # If given, one to three random lights replace the lights above. Their total brightness is
+    # between 1 - value and 1 + value times the normal one.
     drawn_lights: float | None = bounded(None, 0.0, 1.0)
 
     def validate(self) -> None:
         """Checks the constraints that types and ranges cannot express.
 
         Raises:
-            ValueError: a field violates one. The message begins with its path, `appearance.x`.
+            ValueError: a field violates a constraint. The message begins with the field's path,
+                such as `appearance.lights`.
         """
         for pattern, share in self.sheen.items():
             if not 0.0 <= share <= 1.0:

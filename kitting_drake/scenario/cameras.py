@@ -1,4 +1,4 @@
-"""The variants of a scenario's cameras, and their conversion to Drake's cameras.
+"""The types of cameras in a scenario, and their conversion to Drake's cameras.
 
 Drake's YAML loader needs evaluated annotations, hence no `from __future__ import annotations`.
 """
@@ -24,13 +24,14 @@ _NEAR, _FAR = 0.01, 10.0
 class Pinhole:
     """An RGB-D camera placed by roll, pitch and yaw: a short form of Drake's `CameraConfig`.
 
-    z points along the viewing direction, x to the right in the image, y down.
+    In the camera's frame, z points along the viewing direction, x to the right in the image, and y
+    down.
     """
 
     # Position in the world, in m.
     position: list[float] = bounded([1.0, 0.0, 0.75], -10.0, 10.0)
 
-    # Roll, pitch and yaw, R = Rz Ry Rx, in degrees.
+    # Roll, pitch and yaw in degrees; the rotation is R = Rz(yaw) Ry(pitch) Rx(roll).
     rpy_deg: list[float] = bounded([45.0, 180.0, -90.0], *_ANGLE)
 
     # Image size in pixels, focal length in pixels; the principal point is the image's middle.
@@ -65,15 +66,15 @@ class LookAt:
         """Checks that the camera does not look straight up or down, where upright is undefined.
 
         Raises:
-            ValueError: it does so. The message lacks its subject, which the caller adds: the
-                camera's name.
+            ValueError: the camera looks straight up or down. The caller must put the camera's name
+                before the message.
         """
         if self.position[:2] == self.target[:2]:
             raise ValueError("looks straight up or down, so upright is undefined: use !Pinhole")
 
 
 Camera: TypeAlias = Pinhole | LookAt | CameraConfig
-"""The variants of a scenario's cameras."""
+"""The types of cameras in a scenario."""
 
 
 def _camera_config(camera: Pinhole | LookAt, X_PB: Transform) -> CameraConfig:
@@ -98,15 +99,15 @@ def _config(camera: Camera) -> CameraConfig:
 
 
 _UNUSED = ("renderer_name", "renderer_class", "fps", "capture_offset", "output_delay", "lcm_bus")
-"""Fields of a CameraConfig without effect, as images are rendered on demand."""
+"""Fields of a CameraConfig that have no effect, because images are rendered on demand."""
 
 
 def check_camera(camera: Camera) -> None:
     """Checks the constraints that types and ranges cannot express.
 
     Raises:
-        ValueError: the camera violates one. The message lacks its subject, which the caller adds:
-            the camera's name.
+        ValueError: the camera violates a constraint. The caller must put the camera's name before
+            the message.
     """
     if isinstance(camera, LookAt):
         camera.validate()
@@ -138,7 +139,7 @@ def depth_camera(camera: Camera, renderer: str) -> DepthRenderCamera:
 
     Args:
         camera: the camera of a scenario.
-        renderer: the name of its render engine.
+        renderer: the name of the camera's render engine.
     """
     config = copy.deepcopy(_config(camera))
     config.renderer_name = renderer

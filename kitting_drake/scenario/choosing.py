@@ -27,7 +27,7 @@ def scenario_parser(command: str, description: str) -> argparse.ArgumentParser:
         "--output",
         type=Path,
         metavar="DIR",
-        help="folder for all files (default: a subfolder of output/ named after the scenario)",
+        help="folder for all files (default: a subfolder of output/, named after the scenario)",
     )
     parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
     return parser
@@ -42,7 +42,7 @@ def add_scenario_flags(parser: argparse.ArgumentParser) -> None:
         help="which scenario in the file (default: the first)",
     )
     parser.add_argument(
-        "--scenario_text", metavar="YAML", help="fields to merge over those of the scenario"
+        "--scenario_text", metavar="YAML", help="fields that override those of the scenario"
     )
     parser.add_argument(
         "--perturb",
@@ -58,17 +58,19 @@ class ChosenScenario:
     scenario: Scenario
     path: Path
     name: str
-    """The file's name without its suffix, then `:NAME` if a scenario was named."""
+    """The file's name without its suffix, followed by `:NAME` if a scenario in the file was
+    named."""
     text: str | None
-    """The YAML merged over it."""
+    """The YAML that is merged over the scenario."""
     perturbed: str | None = None
-    """Its perturbations, in the syntax of `--perturb`."""
+    """The scenario's perturbations, in the syntax of `--perturb`."""
     moved_to: Path | None = None
-    """The folder of relative paths in the scenario, if not that of its file."""
+    """The base folder of relative paths in the scenario; None if it is the folder of the scenario's
+    file."""
 
     @property
     def base(self) -> Path:
-        """The folder of relative paths in the scenario."""
+        """The base folder of relative paths in the scenario."""
         return (self.moved_to or self.path.resolve().parent).resolve()
 
     @contextlib.contextmanager
@@ -86,20 +88,21 @@ class ChosenScenario:
 
     @property
     def described(self) -> dict[str, Any]:
-        """The whole scenario with its defaults, as JSON values; variants have a `_tag`."""
+        """The whole scenario with its defaults, as JSON values. The key `_tag` names the type of a
+        field with several types."""
         return describe(self.scenario)
 
     def identity(self) -> dict[str, Any]:
         """The scenario, versions and digests of its input files.
 
-        Episodes depend on them, so a resumed run must have the same.
+        Episodes depend on these values, so a run can be resumed only if they are equal.
         """
         scenario = self.scenario
         return {
             **self.described,
             "versions": versions(),
             "policy_digest": scenario.policy.digest(self.base),
-            # The type depends on the machine, and results differ between types.
+            # The floating-point type depends on the machine, and results depend on the type.
             "compute_type": scenario.policy.details(self.base).get("compute_type"),
             "task_digest": files_digest(scenario.task.input_files(self.base)),
         }
@@ -122,13 +125,14 @@ def choose_scenario(arguments: argparse.Namespace) -> ChosenScenario:
 def find_scenario(
     path: Path, name: str | None = None, text: str | None = None, perturb: str | None = None
 ) -> ChosenScenario:
-    """Loads a scenario as the command line does; the arguments are those of `load_scenario`.
+    """Loads a scenario as the command line does. For the arguments and errors see `load_scenario`.
 
     Raises:
         UserError: as `load_scenario`.
     """
     if not path.exists() and not path.is_absolute() and ".." not in path.parts:
-        # In any folder, `scenarios/x.yaml` finds the scenarios of an installed wheel.
+        # In any working directory, `scenarios/x.yaml` also finds the scenarios of an installed
+        # wheel.
         inside = path.relative_to(SCENARIOS.name) if path.parts[0] == SCENARIOS.name else path
         path = SCENARIOS / inside if (SCENARIOS / inside).is_file() else path
     scenario = load_scenario(path, name, text, perturb)

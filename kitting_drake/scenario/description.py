@@ -11,7 +11,8 @@ from kitting_drake.scenario.yaml_input.drake_configs import struct_fields
 
 
 def describe(value: Any) -> Any:
-    """A scenario or a part of it as JSON values, with defaults; variants have a `_tag`."""
+    """Converts a scenario or a part of it, with defaults, to JSON values. The key `_tag` names the
+    type of a field with several types."""
     if dataclasses.is_dataclass(value):
         fields = {
             item.name: describe(getattr(value, item.name))

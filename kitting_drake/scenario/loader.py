@@ -22,8 +22,8 @@ from systems.hand_geometry import JOINT_LIMITS
 _APPROXIMATIONS = ("lagged", "similar", "sap")
 
 _PLAINLY_BELOW = 0.02
-"""Least distance of a negative heightmap.z_min below the table, in m. A smaller distance could be a
-calibration error of the cameras (see `systems.surface_heights`)."""
+"""A negative heightmap.z_min must be at least this far below the table, in m. A smaller distance
+could be a calibration error of the cameras (see `systems.surface_heights`)."""
 
 
 def load_scenario(
@@ -34,9 +34,9 @@ def load_scenario(
     Args:
         path: a YAML file that maps names to scenarios.
         name: the name of the scenario; None for the first.
-        text: YAML to merge over the scenario. Mappings merge field by field; other values are
-            replaced. A mapping without a tag keeps the variant that it is merged over. A camera
-            set to null is removed.
+        text: YAML to merge over the scenario. Mappings are merged field by field; other values are
+            replaced. A mapping without a tag keeps the type of the value over which it is merged. A
+            camera that is set to null is removed.
         perturb: perturbations (see `scenario.perturbations`), merged before `text`.
 
     Raises:
@@ -48,7 +48,7 @@ def load_scenario(
         reason = getattr(error, "strerror", None) or "it is not a text file"
         raise UserError(f"cannot read the scenario {path}: {reason}") from error
     root = parse(content, str(path))
-    # By convention, such names hold YAML anchors.
+    # By convention, such names hold YAML anchors and are not scenarios.
     names = [name for name in root if not name.startswith(("x-", "."))]
     fields = {item.name for item in dc.fields(Scenario)}
     if names and not set(names) - fields:
@@ -65,7 +65,8 @@ def load_scenario(
     scenario = _load(root[name], Scenario(), f"{path}: {name}", base)
     if perturb is not None:
         overlay = perturbation(perturb, scenario)
-        # The last paint wins, but merging over an existing pattern would keep its position.
+        # The last matching paint wins, but a merge over an existing pattern would keep the
+        # pattern's position. Remove it first.
         kept = {
             name: paint
             for name, paint in scenario.appearance.paints.items()
@@ -83,8 +84,9 @@ def load_scenario(
 def _onto(raw: dict, defaults: Scenario) -> tuple[dict, Scenario]:
     """Prepares YAML and defaults for merging.
 
-    Drake reads an untagged mapping as the union's first variant. This adds the tag of the current
-    variant. If a tag selects another variant, the mappings given replace its default mappings.
+    Drake reads an untagged mapping as the first type of a union. This function adds the tag of the
+    present value's type. If a tag selects another type, the given mappings replace that type's
+    default mappings.
     """
     tagged = dict(raw)
     for name in ("task", "policy", "robot"):
@@ -108,9 +110,9 @@ def _onto(raw: dict, defaults: Scenario) -> tuple[dict, Scenario]:
 
 
 def _without_mappings(given: dict, current: Task) -> Task:
-    """The task to merge `given` over.
+    """Returns the task over which `given` is merged.
 
-    If `given` selects another variant, this is that variant's default with emptied mappings.
+    If `given` selects another type of task, it is that type's default, with empty mappings.
     """
     for variant in typing.get_args(Task):
         if variant is PythonTask:
@@ -127,7 +129,7 @@ def _without_mappings(given: dict, current: Task) -> Task:
 
 
 def _of_variant(given: object, current: object) -> object:
-    """Adds the current variant's tag to an untagged mapping."""
+    """Adds the tag of the present value's type to an untagged mapping."""
     return {"_tag": f"!{type(current).__name__}", **given} if isinstance(given, dict) else given
 
 
@@ -149,9 +151,10 @@ def _load(
     Args:
         raw: the mapping, as `parse` returns it.
         defaults: the values of absent fields.
-        where: its name in errors.
+        where: name of the mapping in error messages.
         base: the folder of the scenario's file.
-        merged: whether mappings by name (cameras, tools) extend the default ones or replace them.
+        merged: whether mappings from names, such as cameras or tools, are merged with the default
+            ones instead of replacing them.
     """
     try:
         raw = {} if raw is None else raw
@@ -196,13 +199,13 @@ def _check_meaning(scenario: Scenario) -> None:
         )
     if scenario.heightmap.z_min > 0:
         raise ValueError(
-            f"heightmap.z_min is {scenario.heightmap.z_min:g}, above the table, whose height the "
-            "hand needs: use 0 or less"
+            f"heightmap.z_min is {scenario.heightmap.z_min:g}, but the heightmap must include the "
+            "table, which is at 0: use 0 or less"
         )
     if -_PLAINLY_BELOW < scenario.heightmap.z_min < 0:
         raise ValueError(
-            f"heightmap.z_min is {scenario.heightmap.z_min:g}, which looks like a calibration "
-            f"error: use 0, or -{_PLAINLY_BELOW:g} or less"
+            f"heightmap.z_min is {scenario.heightmap.z_min:g}, too little below the table to "
+            f"differ from a calibration error: use 0, or -{_PLAINLY_BELOW:g} or less"
         )
     if scenario.heightmap.z_max <= scenario.heightmap.z_min:
         raise ValueError("heightmap.z_max must be above heightmap.z_min")
@@ -224,7 +227,7 @@ def _check_meaning(scenario: Scenario) -> None:
     lowest = scenario.heightmap.z_max + planner.travel_clearance
     if planner.home[2] < lowest:
         raise ValueError(
-            f"planner.home[2] is {planner.home[2]:g}, and the hand could hit objects: use at "
+            f"planner.home[2] is {planner.home[2]:g}, where the hand could hit objects: use at "
             f"least {lowest:g} (heightmap.z_max + planner.travel_clearance)"
         )
     if planner.grasp_depth > planner.max_grasp_depth:

@@ -1,4 +1,4 @@
-"""Loads `task: !PythonTask`, whose fields are those of a user's class."""
+"""Loads `task: !PythonTask`, whose fields are those of a user's task class."""
 
 import dataclasses
 from pathlib import Path
@@ -28,12 +28,13 @@ def load_own_task(raw: dict[str, Any], current: Task, base: Path) -> PythonTask:
     """Loads a `!PythonTask`.
 
     Args:
-        raw: the mapping `task:` of the scenario, parsed.
-        current: the task to merge over if it has the same class; otherwise ignored.
+        raw: the parsed mapping `task:` of the scenario.
+        current: the present task. If it has the same class, `raw` is merged over it; otherwise it
+            is ignored.
         base: the folder of the scenario's file.
 
     Raises:
-        ValueError: a field is invalid; the message begins with its path.
+        ValueError: a field is invalid. The message begins with the field's path.
         RuntimeError: Drake's YAML loader rejects the mapping.
     """
     fields = {key: value for key, value in raw.items() if key not in ("_tag", _CLASS)}
@@ -56,4 +57,4 @@ def _default(kind: type[TaskConfig]) -> TaskConfig:
     try:
         return kind()
     except TypeError as error:
-        raise ValueError(f"task.class: all its fields need defaults ({error})") from error
+        raise ValueError(f"task.class: all fields of the class need defaults ({error})") from error

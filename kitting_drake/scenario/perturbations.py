@@ -1,6 +1,7 @@
-"""Named sets of imperfections for the flag `--perturb`. Each sets fields of the scenario.
+"""Named sets of imperfections for the flag `--perturb`. Each set gives values to fields of the
+scenario.
 
-A scenario's YAML can give the same fields. All random draws depend on the episode's seed alone.
+The same fields can be set in a scenario's YAML. All random draws depend only on the episode's seed.
 """
 
 import dataclasses as dc
@@ -16,7 +17,8 @@ _OVERLAYS: dict[str, tuple[dict[str, Any], ...]] = {
     "colour": (
         {"appearance": {"paints": {"*": {**_DRAWN, "spread": 0.15}}}},
         {"appearance": {"paints": {"*": _DRAWN}}},
-        # All surfaces of the fixtures share one colour, so that cavities do not stand out.
+        # Give all surfaces of the fixtures the same colour, so that cavities are not marked by
+        # their colour.
         {"appearance": {"paints": {"*": _DRAWN, "fixtures/*": {**_DRAWN, "shared": True}}}},
     ),
     "light": (
@@ -55,20 +57,21 @@ _OVERLAYS: dict[str, tuple[dict[str, Any], ...]] = {
     "distractors": tuple({"task": {"distractors": count}} for count in (2, 4, 8)),
 }
 _WORSE_IF_LESS = ("steepest_deg",)
-"""Fields whose lower values are less perfect. For all others, higher values are."""
+"""Fields of which lower values are less perfect. For all other fields, higher values are less
+perfect."""
 
 NAMES = (*_OVERLAYS, "all")
 
 
 def perturbation(text: str, scenario: Scenario) -> dict[str, Any]:
-    """The scenario fields that a value of `--perturb` sets, to merge over the scenario's own.
+    """Returns the fields that a value of `--perturb` sets, to be merged over the scenario's own.
 
-    They are a nested mapping as from YAML; tags are under the key `_tag`.
+    The result is a nested mapping as YAML gives it, with tags under the key `_tag`.
 
     Args:
         text: `NAME[:LEVEL],...`. The default level is `moderate`. `all` means all perturbations
             that apply to the scenario's task.
-        scenario: the scenario to perturb. Its values stay where they are less perfect.
+        scenario: the scenario to perturb. Its values are kept where they are already less perfect.
 
     Raises:
         UserError: a name or level is unknown, a name is given twice, or a perturbation does not
@@ -100,7 +103,7 @@ def perturbation(text: str, scenario: Scenario) -> dict[str, Any]:
 
 
 def _applies(name: str, scenario: Scenario) -> bool:
-    """Whether the task has the fields of a perturbation and permits it."""
+    """Whether the task has the fields of a perturbation and allows it."""
     if name in scenario.task.not_perturbed:
         return False
     fields = {item.name for item in dc.fields(scenario.task)}
@@ -108,7 +111,7 @@ def _applies(name: str, scenario: Scenario) -> bool:
 
 
 def _keep_worse(overlay: dict[str, Any], found: object) -> None:
-    """Keeps the scenario's number wherever it is less perfect than the overlay's."""
+    """Replaces a number in `overlay` by the scenario's own where that is less perfect."""
     for name, value in overlay.items():
         given = getattr(found, name)
         if isinstance(value, dict) and dc.is_dataclass(given):

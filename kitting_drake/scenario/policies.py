@@ -1,4 +1,4 @@
-"""The variants of a scenario's `policy:`. Each one makes its LeafSystem.
+"""The types of policies in a scenario. Each one makes its LeafSystem.
 
 Drake's YAML loader needs evaluated annotations, hence no `from __future__ import annotations`.
 """
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from kitting_drake.policies.learned_policy import Decision
 
 DecisionObserver = Callable[[Observation, "Decision"], None]
-"""Called with every decision of a learned policy."""
+"""A function that is called with every decision of a learned policy and its observation."""
 
 _TOLD = (
     "scenario",
@@ -59,18 +59,20 @@ class PolicySite:
     """The folder of relative paths in the scenario."""
     observer: DecisionObserver | None = None
     may_stop: bool = True
-    """False if the episode ends as soon as every goal is met (`end_at_success`)."""
+    """Whether the policy may decide to stop. It may not if the episode ends as soon as every goal
+    is met (`end_at_success`)."""
     planner: PickPlaceParameters = field(default_factory=PickPlaceParameters)
     """The parameters of the hand's motion."""
     has_cameras: bool = True
-    """Whether the station provides o_t. Without it, the oracle outputs heights for the planner."""
+    """Whether the station provides the observation o_t. If not, the oracle's actions carry the
+    heights that the planner needs."""
 
 
 class PolicyConfig:
-    """Base class of the variants of a scenario's `policy:`."""
+    """Base class of the types of policies in a scenario."""
 
     needs_observation: bool = True
-    """Whether it needs cameras."""
+    """Whether the policy needs cameras."""
 
     @property
     def name(self) -> str:
@@ -78,8 +80,8 @@ class PolicyConfig:
         return "".join(f"_{c.lower()}" if c.isupper() else c for c in type(self).__name__)[1:]
 
     def make_system(self, site: PolicySite) -> LeafSystem:
-        """Makes the system, with the output port `action`. Each input port has the name of the
-        station's output port that it connects to (see `station.KittingStation`).
+        """Makes the policy's system, with the output port `action`. Each of its input ports has the
+        name of the station's output port to which it is connected (see `station.KittingStation`).
 
         Raises:
             UserError: a field or a file is invalid for this station.
@@ -87,7 +89,7 @@ class PolicyConfig:
         raise NotImplementedError
 
     def details(self, base: Path) -> dict[str, Any]:
-        """Details of the policy for results, as JSON values.
+        """Details of the policy that are reported with results, as JSON values.
 
         Raises:
             UserError: a file cannot be read.
@@ -95,7 +97,7 @@ class PolicyConfig:
         return {}
 
     def digest(self, base: Path) -> str | None:
-        """A digest of the contents of the policy's files; None without files.
+        """A digest of the contents of the policy's files; None if there are no files.
 
         Raises:
             UserError: a file cannot be read.
@@ -103,7 +105,7 @@ class PolicyConfig:
         return None
 
     def input_files(self, base: Path) -> list[Path]:
-        """The user's files that the policy reads, without its modules."""
+        """The user's files that the policy reads, except for its Python modules."""
         return []
 
     def modules(self) -> list[str]:
@@ -111,7 +113,7 @@ class PolicyConfig:
         return []
 
     def training_seeds(self, base: Path) -> set[int]:
-        """The seeds of the demonstrations used in its training or validation.
+        """The seeds of the demonstrations that were used to train or validate the policy.
 
         Raises:
             UserError: a file cannot be read.
@@ -122,7 +124,8 @@ class PolicyConfig:
         """Checks the constraints that types and ranges cannot express.
 
         Raises:
-            ValueError: a field violates one. The message begins with its path, `policy.x`.
+            ValueError: a field violates a constraint. The message begins with the field's path,
+                such as `policy.weights`.
         """
 
 
@@ -141,14 +144,15 @@ class Oracle(PolicyConfig):
 
 @dataclass
 class QuantizedOracle(PolicyConfig):
-    """The oracle with its actions rounded to those of a network.
+    """The oracle with its actions rounded to those that a network of the paper can choose.
 
-    It is an upper bound for the paper's policy.
+    Its success rate is an upper bound for the paper's policy.
     """
 
     needs_observation = False
 
-    # N: angles are rounded to multiples of 2 pi / N, positions to pixel centres of the heightmap.
+    # Number of orientations N. Angles are rounded to multiples of 2 pi / N, and positions to pixel
+    # centres of the heightmap.
     orientations: int = bounded(180, 2, 3600)
 
     def make_system(self, site: PolicySite) -> LeafSystem:
@@ -162,40 +166,43 @@ class QuantizedOracle(PolicyConfig):
 class Learned(PolicyConfig):
     """Networks trained by `train`."""
 
-    # The weights file that `train` wrote, relative to the scenario's folder. Empty: the generalist
-    # in models/policies/.
+    # The weights file that `train` wrote, relative to the scenario's folder. If empty, the policy
+    # for arbitrary tools in models/policies/ is used.
     weights: str = ""
 
-    # N: angles of picks and rotations are multiples of 2 pi / N. The SO(2) method takes any N.
+    # Number of orientations N. The networks predict picks and rotations at multiples of 2 pi / N.
+    # The SO(2) method takes any even N.
     orientations: int = bounded(180, 2, 3600)
 
-    # True: refine actions between pixel centres and between the N orientations. False: as in the
-    # paper, actions are pixel centres and one of the N orientations.
+    # Whether to refine actions between pixel centres and between the N orientations. If false,
+    # actions are pixel centres and one of the N orientations, as in the paper.
     continuous: bool = True
 
-    # Refine actions by the geometry of o_t. Needs `continuous`; the paper does none of this.
+    # Whether to refine actions by the geometry of the observation o_t. Needs `continuous`. The
+    # paper's policy has none of these refinements:
     # - The place: fit the object's outline to that of the recess, if the two agree.
     # - The pick: move the grasp to where the jaws have clearance.
-    # - Touching objects: tell them apart by the outlines of the free recesses.
-    # - Stopping: continue while an object fits into a recess, or one that was not tried yet may.
+    # - Touching objects: separate them by the outlines of the free recesses.
+    # - Stopping: continue while an object fits into a recess, or an untried object may fit.
     # - In tasks without insertion: among rotations that score equally well, choose one with
     #   clearance for the opening fingers.
     fit_outlines: bool = True
 
-    # Do not pick again within 10 mm of a failed grasp. The paper has no such memory.
+    # Whether to avoid picks within 10 mm of a failed grasp. The paper's policy has no such memory.
     avoid_failed_picks: bool = True
 
-    # Recover from failed insertions that o_t shows, and take heaps apart. Press down protruding
-    # objects; then pick objects that fit into a recess; then lay what lies on others on the table;
-    # finally take out objects that do not go down, and retry. Nothing is moved twice in vain. This
-    # needs extra actions: see the task's `tries`.
+    # Whether to recover from failed insertions and to take heaps apart. The policy first presses
+    # down protruding objects, then picks objects that fit into a recess, then lays objects that lie
+    # on others on the table, and at last takes out objects that could not be pressed down, to try
+    # them again. Each object is moved in vain only once. This needs extra actions: see the task's
+    # `tries`.
     recover: bool = False
 
     def make_system(self, site: PolicySite) -> LeafSystem:
         # Outlines and recesses matter only for insertion.
         insertion = any(goal.rim_height is not None for goal in site.scene.goals)
         if self.recover and not insertion:
-            raise UserError("policy.recover must be false, as this task has no insertions")
+            raise UserError("policy.recover must be false: this task has no cavities to fill")
         loaded = load_learned_policy(
             self._path(site.base),
             site.planner,
@@ -214,7 +221,7 @@ class Learned(PolicyConfig):
                 f"heightmap.z_min is {site.grid.z_min:g}, but the policy {loaded.path.name} needs "
                 "0, as in its training"
             )
-        # An observer gets colours even if the networks use heights alone.
+        # An observer gets colours even if the networks use only heights.
         heights_only = not loaded.colour and site.observer is None
         function = loaded.function
         return PickPlacePolicy(
@@ -242,7 +249,7 @@ class Learned(PolicyConfig):
             **{key: file.card.get(key) for key in _TOLD},
             "training_seed": file.card.get("seed"),
             "angle_only": file.card.get("angle_only", False),
-            # The step of the chosen checkpoint.
+            # The training step of the chosen checkpoint.
             "checkpoint_step": (file.card.get("validation") or {}).get("step"),
         }
 
@@ -267,12 +274,12 @@ class Learned(PolicyConfig):
 
 @dataclass
 class ShapeMatching(PolicyConfig):
-    """A training-free policy that fits the outlines of loose objects to those of recesses.
+    """A policy without training that fits the outlines of loose objects to those of recesses.
 
-    It uses heights alone.
+    It uses only heights, not colours.
     """
 
-    # Recover from failed insertions, as !Learned does.
+    # Whether to recover from failed insertions, as for !Learned.
     recover: bool = False
 
     def make_system(self, site: PolicySite) -> LeafSystem:
@@ -288,22 +295,23 @@ class PythonPolicy(PolicyConfig):
     """Your own function from `Observation` to `PickPlaceAction` (see systems/signals.py).
 
     `evaluate` compares the sources of the function's package, or of its module, with those of
-    earlier episodes. It does not check other files that the function reads, such as weights. Use
-    another --output after changing them.
+    earlier episodes, so that a run is not resumed with changed code. It does not check other files
+    that the function reads, such as weights. Use another --output after you change them.
     """
 
     # `module:function`, called with an Observation. The module must be importable, or lie beside
     # the scenario's file.
     function: str = ""
 
-    # Pass a second argument: the poses (`PlanarPose`) of failed grasps, oldest first.
+    # Whether the function takes a second argument, the poses (`PlanarPose`) of failed grasps,
+    # oldest first.
     takes_failed_picks: bool = False
 
     def make_system(self, site: PolicySite) -> LeafSystem:
         try:
             function = import_own(self.function, site.base)
         except (Exception, SystemExit) as error:
-            # A user's module may raise anything.
+            # A user's module may raise any exception.
             reason = f"{type(error).__name__}: {error}"
             raise UserError(f"policy.function: cannot import {self.function}: {reason}") from error
         if not callable(function):
@@ -337,11 +345,11 @@ class PythonPolicy(PolicyConfig):
 
 @dataclass(frozen=True)
 class _OfObservationAlone:
-    """Wraps a function of an observation; ignores the failed picks."""
+    """Wraps a function that takes only an observation. The failed picks are ignored."""
 
     function: Callable[[Observation], PickPlaceAction]
     forgets: bool = False
-    """Whether the observation has no history, either."""
+    """Whether the history is removed from the observation as well."""
 
     def __call__(
         self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()
@@ -353,7 +361,7 @@ class _OfObservationAlone:
 
 
 Policy = Oracle | QuantizedOracle | Learned | ShapeMatching | PythonPolicy
-"""The variants of a scenario's `policy:`; the first is the default."""
+"""The types of policies in a scenario; the first is the default."""
 
 
 def _make_oracle(site: PolicySite, quantizer: ActionQuantizer | None) -> OraclePolicy:
@@ -390,7 +398,7 @@ def _cluttered_table(site: PolicySite) -> ClutteredTable | None:
 
 
 def _ledge(scene: Scene) -> Ledge | None:
-    """The first fixture that the hand keeps clear of: the kit's block."""
+    """The kit's block, over whose edges objects can be turned; None if there is none."""
     for item in scene.fixtures:
         if item.p_FPoints is not None:
             length, width, _ = np.ptp(item.p_FPoints, axis=0).tolist()

@@ -1,4 +1,4 @@
-"""The variants of a scenario's `robot:`.
+"""The types of robots in a scenario.
 
 Drake's YAML loader needs evaluated annotations, hence no `from __future__ import annotations`.
 """
@@ -15,7 +15,7 @@ from systems.bounds import bounded
 from systems.signals import PixelGrid
 
 FOOT = 0.08
-"""How far the foot of an arm reaches in front of its base, in m."""
+"""How far the foot of an arm extends in front of its base, in m."""
 
 
 @dataclass
@@ -26,7 +26,7 @@ class FloatingHand:
     """
 
     def validate(self, grid: PixelGrid) -> None:
-        """Accepts all."""
+        """Does nothing: there is nothing to check."""
 
 
 @dataclass
@@ -36,35 +36,37 @@ class FrankaArm:
     # fr3 (Franka Research 3) or panda (Franka Emika Robot).
     model: str = "fr3"
 
-    # The base: x, y, z in m, and its rotation about the world's z. At zero it faces +x. From here
-    # it reaches all of the default kitting scenes, nearly all with the arm in a vertical plane.
+    # Pose of the base: x, y, z in the world, in m. At zero rotation the arm faces +x. From the
+    # default position it reaches everything in the default kitting scenes, nearly always with the
+    # whole arm in one vertical plane.
     base: list[float] = bounded([0.04, 0.0, 0.0], -3.0, 3.0)
     yaw_deg: float = bounded(0.0, -180.0, 180.0)
 
-    # Joint impedance, base to flange, in N m/rad and N m s/rad: see `systems.joint_controller`.
-    # libfranka offers up to 14250; stiff or damped joints hit harder when the hand touches.
+    # Stiffness and damping of the joints, from base to flange, in N m/rad and N m s/rad; see
+    # `systems.joint_controller`. libfranka allows stiffnesses up to 14250. Stiffer or more damped
+    # joints cause larger impact forces.
     stiffness: list[float] = bounded(
         [1200.0, 1200.0, 1200.0, 1000.0, 1000.0, 800.0, 800.0], 0.0, 14250.0
     )
     damping: list[float] = bounded([55.0, 75.0, 55.0, 50.0, 22.0, 18.0, 18.0], 0.0, 1000.0)
 
-    # Viscous friction of each joint in N m s/rad, which the controller does not know. A real arm
-    # compensates most of its friction.
+    # Viscous friction of each joint in N m s/rad. The controller does not compensate it. The
+    # default is small, because a real arm compensates most of its friction.
     friction: list[float] = bounded([0.003] * 7, 0.0, 100.0)
 
-    # It waits at planner.home, but no higher than this, in m: there it hides nothing from the
-    # default cameras, and heights above 0.28 m are not part of o_t.
+    # The hand waits at planner.home, but no higher than this, in m. At the default height it hides
+    # nothing from the default cameras, and it is above the largest height of o_t, 0.28 m.
     highest_wait: float = bounded(0.31, 0.0, 2.0)
 
-    # Standard deviation of the estimated external joint torques, from which the arm computes the
-    # force on its hand, in N m.
+    # Standard deviation of the noise of the external joint torques, in N m, from which the arm
+    # estimates the contact force on its hand.
     torque_noise: float = bounded(0.0, 0.0, 10.0)
 
     def validate(self, grid: PixelGrid) -> None:
-        """Checks what ranges cannot express.
+        """Checks the constraints that types and ranges cannot express.
 
         Args:
-            grid: the workspace.
+            grid: pixel grid of the workspace.
 
         Raises:
             ValueError: the model is unknown, or the base is in the workspace or in the table.
@@ -79,9 +81,9 @@ class FrankaArm:
         away = float(np.linalg.norm(base - np.clip(base, lower, upper)))
         if away < FOOT:
             raise ValueError(
-                f"robot.base is {at}, but there the arm's foot stands in the workspace: keep "
-                f"{FOOT:g} m from x {lower[0]:g} to {upper[0]:g} and y {lower[1]:g} to "
-                f"{upper[1]:g}"
+                f"robot.base is {at}, but there the arm's foot stands in the workspace: keep it "
+                f"{FOOT:g} m away from the workspace, which is x {lower[0]:g} to {upper[0]:g} and "
+                f"y {lower[1]:g} to {upper[1]:g}"
             )
         on_table = np.linalg.norm(base - np.clip(base, *TABLE)) < FOOT
         if on_table and self.base[2] < 0:
@@ -90,7 +92,7 @@ class FrankaArm:
             )
 
     def arm_base(self) -> ArmBase:
-        """The pose of its base."""
+        """The pose of the arm's base."""
         x, y, z = self.base
         return ArmBase(x, y, z, math.radians(self.yaw_deg))
 

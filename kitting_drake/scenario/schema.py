@@ -1,7 +1,8 @@
 """The YAML schema of a scenario, modelled on Drake's hardware_sim.
 
-A file maps names to scenarios. Every field has a default: `Defaults: {}` is a valid scenario. A tag
-selects the variant of a union: `policy: !Oracle {}`. Some fields are Drake's own configs.
+A file maps names to scenarios. Every field has a default, so `Defaults: {}` is a valid scenario.
+For fields with several types, a tag selects the type, as in `policy: !Oracle {}`. Some fields are
+Drake's own configs.
 
 Units are SI. Names of fields in degrees end in `_deg`.
 
@@ -27,9 +28,9 @@ from systems.signals import PixelGrid
 
 @dc.dataclass
 class Heightmap:
-    """The orthographic observation o_t and the workspace.
+    """The pixel grid of the orthographic observation o_t, which also defines the workspace.
 
-    Tasks draw poses on the part of the table that lies within it.
+    Tasks draw poses on the part of the table that lies within the workspace.
     """
 
     # Lower (x, y) corner of the workspace in the world, in m.
@@ -41,9 +42,9 @@ class Heightmap:
     rows: int = bounded(160, 1, 4096)
     cols: int = bounded(320, 1, 4096)
 
-    # Range of heights in the world, in m. Lower points read as z_min; points above z_max are
-    # ignored. Learned policies need z_min = 0, the height of the table. If your scene has points
-    # below the table, use z_min = -0.02 or lower.
+    # Range of heights in the world, in m. Points below z_min get the height z_min; points above
+    # z_max are ignored. Learned policies need z_min = 0, the height of the table. If your scene has
+    # points below the table, use z_min = -0.02 or lower.
     z_min: float = bounded(0.0, -1.0, 10.0)
     z_max: float = bounded(0.28, -1.0, 10.0)
 
@@ -56,14 +57,14 @@ class Heightmap:
 class Controller:
     """Gains and force limits of the TrajectoryController."""
 
-    # For x, y, z (N/m, N s/m) and yaw (N m/rad, N m s/rad).
+    # Stiffness and damping for x, y, z (N/m, N s/m) and yaw (N m/rad, N m s/rad).
     stiffness: list[float] = bounded([10000.0, 10000.0, 10000.0, 120.0], 0.0, 1e6)
     damping: list[float] = bounded([320.0, 320.0, 320.0, 4.2], 0.0, 1e5)
 
-    # For x, y, z (N) and yaw (N m).
+    # Largest forces on x, y, z (N) and largest torque on yaw (N m).
     force_limit: list[float] = bounded([150.0, 150.0, 150.0, 12.0], 1e-3, 1e4)
 
-    # For each finger: N/m, N s/m, N.
+    # Stiffness (N/m), damping (N s/m) and largest force (N) of each finger's drive.
     finger_stiffness: float = bounded(800.0, 1.0, 1e5)
     finger_damping: float = bounded(16.0, 0.0, 1e4)
     finger_force_limit: float = bounded(140.0, 1.0, 140.0)
@@ -71,10 +72,10 @@ class Controller:
 
 @dc.dataclass
 class Variation:
-    """Random variation of all models but the hand."""
+    """Random variation of all models except the robot."""
 
-    # Each model's friction coefficients are multiplied by a factor between 1 - value and 1 + value,
-    # drawn from the seed. Likewise its mass.
+    # The friction coefficients of each model are multiplied by a random factor between 1 - value
+    # and 1 + value. `mass` does the same for its mass.
     friction: float = bounded(0.0, 0.0, 0.9)
     mass: float = bounded(0.0, 0.0, 0.9)
 
@@ -85,15 +86,16 @@ class Sleep:
 
     enabled: bool = True
 
-    # An object falls asleep when it stays within these tolerances (m, rad) of one pose for
+    # An object is frozen when it has stayed within these tolerances (m, rad) of one pose for
     # `time_to_sleep`.
     position_tolerance: float = bounded(0.0005, 0.0, 0.01)
     angle_tolerance: float = bounded(0.02, 0.0, 1.0)
 
-    # In s.
+    # Time for which an object must stay in place before it is frozen, in s.
     time_to_sleep: float = bounded(0.25, 0.0, 10.0)
 
-    # It wakes when the hand or an awake object comes within this distance, in m.
+    # A frozen object is freed when the hand or an object that is not frozen comes within this
+    # distance, in m.
     wake_distance: float = bounded(0.006, 0.001, 1.0)
 
 
@@ -107,17 +109,18 @@ class Scenario:
     # Longest simulated time of an episode, in s.
     time_limit: float = bounded(180.0, 0.1, 1e6)
 
-    # True: end the episode as soon as every goal is met, as in Ravens and the paper. Learned
-    # policies then never decide to stop. False: the policy must detect that it is done.
+    # Whether to end the episode as soon as every goal is met, as in Ravens and the paper. Learned
+    # policies then never decide to stop. If false, the policy must detect that it is done.
     end_at_success: bool = False
 
-    # 1: real time. 0: as fast as possible.
+    # Speed of the simulation: 1 for real time, 0 for as fast as possible.
     target_realtime_rate: float = bounded(0.0, 0.0, 100.0)
 
     # The objects on the table and their goals: see kitting_drake/tasks/.
     task: Task = dc.field(default_factory=Kitting)
 
-    # !Oracle, !QuantizedOracle, !Learned, !ShapeMatching or !PythonPolicy: see policies.py.
+    # The policy: !Oracle, !QuantizedOracle, !Learned, !ShapeMatching or !PythonPolicy; see
+    # policies.py.
     policy: Policy = dc.field(default_factory=Oracle)
 
     # The RGB-D cameras by name: !Pinhole, !LookAt, or Drake's !CameraConfig. See cameras.py. The
@@ -140,7 +143,7 @@ class Scenario:
     # The policy's observation.
     heightmap: Heightmap = dc.field(default_factory=Heightmap)
 
-    # !FloatingHand, or !FrankaArm for a whole arm: see robots.py.
+    # The robot: !FloatingHand, or !FrankaArm for a whole arm; see robots.py.
     robot: Robot = dc.field(default_factory=FloatingHand)
 
     # The motion of the hand, and its control.

@@ -1,4 +1,4 @@
-"""Packs a scenario and its files as the `runtime_env` of a Ray cluster."""
+"""Packs a scenario and its files for the workers of a Ray cluster, as a `runtime_env`."""
 
 import dataclasses
 import importlib.util
@@ -18,7 +18,8 @@ from kitting_drake.scenario.choosing import ChosenScenario
 _PACKAGES = ("kitting_drake", "systems")
 
 _FILES = Path("files")
-"""Subfolder with links to the scenario's files, by their absolute paths on this machine."""
+"""Subfolder with links to the scenario's files. The links have the files' absolute paths on this
+machine."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,17 +27,19 @@ class Shipment:
     """The result of `pack`."""
 
     chosen: ChosenScenario
-    """The scenario with its paths relative to the packed folder."""
+    """The scenario, with paths relative to the packed folder."""
     runtime_env: dict[str, Any]
-    """Ray's working folder, the user's modules, and environment variables."""
+    """Ray's `runtime_env`, with the working folder, the user's modules, and environment
+    variables."""
 
 
 def pack(chosen: ChosenScenario, folder: Path) -> Shipment:
     """Packs the files that another machine needs to run a scenario.
 
-    They are the packages and models of this project, the files that task and policy read (weights,
-    a user's tools), and the modules of a `!PythonPolicy` or `!PythonTask`. Other packages must be
-    installed on the other machine. The folder holds links, whose targets Ray copies.
+    These files are the packages and models of this project, the files that task and policy read
+    (such as weights or a user's tools), and the modules of a `!PythonPolicy` or `!PythonTask`.
+    Other packages must be installed on the other machine. The folder contains links, whose targets
+    Ray copies.
 
     Args:
         chosen: a scenario that can be built here.
@@ -60,7 +63,7 @@ def pack(chosen: ChosenScenario, folder: Path) -> Shipment:
             link = folder / _copy(path)
             link.parent.mkdir(parents=True, exist_ok=True)
             link.symlink_to(path)
-        # A relative path that begins with `..` needs this folder to exist.
+        # A relative path that begins with `..` can be resolved only if this folder exists.
         (folder / _copy(base)).mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UserError(f"cannot pack {error.filename}: {error.strerror}") from error
@@ -98,16 +101,17 @@ def _own_modules(modules: Iterable[str]) -> list[Path]:
             continue
         # A package without an `__init__.py` may have several folders.
         places = [Path(place) for place in spec.submodule_search_locations or [spec.origin or ""]]
-        # Installed packages must be installed on the node too.
+        # Packages that are installed here must be installed on the node as well, so they are not
+        # packed.
         installed = sysconfig.get_path("purelib")
         found += [path for path in places if path.exists() and not path.is_relative_to(installed)]
     return found
 
 
 def _relative(value: Any, base: Path, places: set[Path]) -> Any:
-    """Copies a value with every path to one of `places` made relative to `base`.
+    """Copies a value and makes every path to one of `places` relative to `base`.
 
-    Absolute paths differ on the node, and Ray resolves symbolic links.
+    Absolute paths would not be valid on the node, and Ray resolves symbolic links.
     """
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = {

@@ -17,7 +17,8 @@ from kitting_drake.scenario.shipping import pack
 def add_workers_flags(parser: argparse.ArgumentParser) -> None:
     """Adds the mutually exclusive flags `--workers` and `--ray`."""
     flags = parser.add_mutually_exclusive_group()
-    # No default: argparse misses the conflict if the value given equals the default.
+    # Set no default, because argparse would not detect a conflict if the given value equals the
+    # default.
     flags.add_argument(
         "--workers", type=count_type, help=f"number of parallel processes ({os.cpu_count()})"
     )
@@ -41,7 +42,8 @@ def open_workers(
         UserError: the cluster cannot be reached or cannot run the work.
     """
     if arguments.ray is None:
-        # A user's function may keep state, which must not carry over between episodes.
+        # A user's function may keep state, which must not be carried over between episodes, so use
+        # a new process for each.
         scenario = chosen.scenario
         reuse = not (scenario.policy.modules() or scenario.task.modules())
         with LocalWorkers(arguments.workers or os.cpu_count() or 1, reuse=reuse) as local:

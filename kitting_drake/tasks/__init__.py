@@ -1,4 +1,4 @@
-"""Tasks: their scenes, goals and success predicates."""
+"""Tasks, with their scenes, goals and success predicates."""
 
 from kitting_drake.tasks.kitting.arranged import ArrangedKitting
 from kitting_drake.tasks.kitting.kitting import Kitting, ToolsetKitting
@@ -22,7 +22,7 @@ Task = (
     | AssemblingKits
     | PythonTask
 )
-"""The variants of a scenario's `task:`; the first is the default."""
+"""The types of tasks in a scenario; the first is the default."""
 
 PAPER_TASKS = {task.title: task for task in (Kitting(), ToolsetKitting(split="test"))}
 """The paper's tasks (section V-B.1) by title, with default parameters."""

@@ -1,4 +1,4 @@
-"""Boxes of any size and colour: models, surface points, grasps and footprints.
+"""Models, surface points, grasps and footprints of boxes of any size and colour.
 
 The frame B of a box has its origin in the middle of its bottom and its axes along the edges.
 """
@@ -22,7 +22,7 @@ _FILE = "model.sdf"
 Colour = tuple[float, float, float]
 """Diffuse red, green and blue, in [0, 1]."""
 
-# Tableau's ten colours, as in Ravens.
+# The ten colours of Tableau's palette, as in Ravens.
 COLOURS: dict[str, Colour] = {
     name: (red / 255, green / 255, blue / 255)
     for name, (red, green, blue) in {
@@ -40,12 +40,12 @@ COLOURS: dict[str, Colour] = {
 }
 
 CUBE_SIDE = 0.04
-"""In metres."""
+"""Side of a small cube, in metres."""
 CUBE_MASS = 0.01
-"""In kg."""
+"""Mass of a small cube, in kg."""
 
 _MAX_WIDTH = 0.072
-"""Largest width of a box that the open jaws fit around with clearance, in metres."""
+"""Largest width of a box around which the open jaws fit with clearance, in metres."""
 _POINT_SPACING = 0.004
 
 _MODEL = """<?xml version="1.0"?>
@@ -95,7 +95,8 @@ def box_object(
     mass: float = 0.1,
     friction: float = 1.0,
 ) -> SceneObject:
-    """A box to pick; sizes in metres, mass in kg. Default grasps: those around its middle."""
+    """A box that can be picked. Sizes are in metres, the mass in kg. The default grasps are those
+    around its middle."""
     return SceneObject(
         name=name,
         category=category,
@@ -110,7 +111,7 @@ def box_object(
 def cube_object(
     name: str, colour: Colour, X_WB: RigidTransform, grasps: tuple[Grasp, ...]
 ) -> SceneObject:
-    """A small cube of Ravens."""
+    """A small cube of the Ravens tasks."""
     size = (CUBE_SIDE,) * 3
     return box_object(name, "cube", size, colour, X_WB, grasps=grasps, mass=CUBE_MASS)
 
@@ -118,7 +119,8 @@ def cube_object(
 def box_model(
     size: tuple[float, float, float], colour: Colour, *, mass: float, friction: float
 ) -> Path:
-    """The SDFormat file of a homogeneous box, in the cache. Equal boxes share a file."""
+    """Writes the SDFormat file of a homogeneous box to the cache and returns its path. Equal boxes
+    share a file."""
     x, y, z = size
     text = _MODEL.format(
         middle=z / 2,
@@ -134,10 +136,11 @@ def box_model(
 
 
 def coloured(model: str, colour: Colour) -> Path:
-    """A model of `models/ravens` in another colour, in the cache.
+    """Writes a copy of a model of `models/ravens` in another colour to the cache, and returns its
+    path.
 
     Args:
-        model: the SDFormat file's name; the file contains one diffuse colour.
+        model: name of the SDFormat file, which must contain exactly one diffuse colour.
         colour: the new colour.
     """
     text = (MODELS / "ravens" / model).read_text()
@@ -146,7 +149,7 @@ def coloured(model: str, colour: Colour) -> Path:
 
 
 def box_points(size: tuple[float, float, float]) -> NDArray[np.float64]:
-    """(m, 3) evenly spaced points on the surface of a box, in B, in metres."""
+    """(m, 3) evenly spaced points on the surface of a box, in its frame B, in metres."""
     half = np.array(size) / 2
     faces = []
     for axis in range(3):
@@ -160,7 +163,7 @@ def box_points(size: tuple[float, float, float]) -> NDArray[np.float64]:
 
 
 def box_grasps(size: tuple[float, float, float]) -> tuple[Grasp, ...]:
-    """Grasps around the middle of a box, across its narrower side first."""
+    """Grasps around the middle of a box. The first is across its narrower side."""
     x, y, z = size
     grasps = [
         Grasp(x=0.0, y=0.0, theta=0.0, width=y, surface_height=z),
@@ -187,13 +190,13 @@ def grasp_along(size: tuple[float, float, float], axis: str, offset: float) -> G
 def random_grasp(
     size: tuple[float, float, float], offset: float, rng: np.random.Generator
 ) -> Grasp:
-    """A random grasp on one of a box's centre lines, within a distance of its middle."""
+    """A random grasp on one of a box's centre lines, at most `offset` metres from its middle."""
     axis = "x" if rng.random() < 0.5 else "y"
     return grasp_along(size, axis, float(rng.uniform(-offset, offset)))
 
 
 def box_symmetry(size: tuple[float, float, float]) -> int:
-    """The rotational symmetry of a box about its vertical axis."""
+    """The order of a box's rotational symmetry about its vertical axis."""
     return 4 if math.isclose(size[0], size[1]) else 2
 
 
@@ -208,19 +211,20 @@ def box_footprint(size: tuple[float, float, float], offset: float = 0.0) -> Foot
 
 
 def outermost_grasps(size: tuple[float, float, float], offset: float) -> tuple[Grasp, ...]:
-    """The grasps of a box farthest from its middle. All others need no more room than these."""
+    """The grasps of a box that are farthest from its middle. No other grasp needs more room than
+    these."""
     return tuple(
         grasp_along(size, axis, distance) for axis in ("x", "y") for distance in (-offset, offset)
     )
 
 
 CUBE_GRASP_OFFSET = 0.01
-"""The demonstrator grasps a cube within this distance of its middle, in metres."""
+"""The demonstrator grasps a cube at most this far from its middle, in metres."""
 CUBE_FOOTPRINT = box_footprint((CUBE_SIDE,) * 3, CUBE_GRASP_OFFSET)
 
 
 def random_brown(rng: np.random.Generator) -> Colour:
-    """A random brown between dark and light."""
+    """A random brown colour between dark and light."""
     red, green, blue = (float(rng.uniform(0.5, 1.5)) * np.array(COLOURS["brown"])).tolist()
     return red, green, blue
 

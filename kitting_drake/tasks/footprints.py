@@ -1,4 +1,4 @@
-"""Draws poses on the table that are free of each other and reachable by the open hand."""
+"""Draws poses on the table at which objects do not overlap and the open hand has room."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ from systems.hand_geometry import FINGER_DEPTH, FINGER_LENGTH, MAX_OPENING, PALM
 from systems.signals import PixelGrid
 
 OPEN_FINGERS = (FINGER_LENGTH, MAX_OPENING + 2 * FINGER_DEPTH)
-"""The area of the open fingers and between them, from above: along the pads and across, in m."""
+"""Size of the area of the open fingers and of the gap between them, seen from above: along the pads
+and across them, in m."""
 
 _TRIES = 200
 _RESTARTS = 50
@@ -34,24 +35,24 @@ Polygon = NDArray[np.float64]
 def rectangle(
     length: float, width: float, *, x: float = 0.0, y: float = 0.0, theta: float = 0.0
 ) -> Polygon:
-    """A rectangle with its middle at (x, y), rotated by theta radians."""
+    """A rectangle with its middle at (x, y), rotated by theta; in metres and radians."""
     corners = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)]) * (length / 2, width / 2)
     return _moved(corners, x, y, theta)
 
 
 def disc(radius: float, *, sides: int = 16) -> Polygon:
-    """A regular polygon that contains a disc about the origin."""
+    """A regular polygon around a disc whose middle is the origin; in metres."""
     angles = np.arange(sides) * math.tau / sides
     corners = radius / math.cos(math.pi / sides) * np.column_stack([np.cos(angles), np.sin(angles)])
     return np.asarray(corners)
 
 
 def separation(a: Polygon, b: Polygon) -> float:
-    """The separation of two convex polygons, in metres.
+    """Measures how far two convex polygons are apart.
 
     Returns:
-        The widest gap between them along a normal of one of their sides. It is at most their
-        distance, and negative if and only if they overlap.
+        The widest gap between them along a normal of one of their sides, in metres. It is at most
+        their distance, and negative if and only if they overlap.
     """
     gaps = [
         ((corners @ normals.T).min(axis=0) - (own @ normals.T).max(axis=0)).max()
@@ -66,15 +67,17 @@ class Footprint:
     """The area that an object or fixture covers on the table, in its own frame, in metres."""
 
     body: tuple[Polygon, ...]
-    """Convex pieces of its area."""
+    """Convex pieces of the covered area."""
     grasps: tuple[Grasp, ...] = ()
-    """Grasps at which the hand picks or places there; the open fingers need free space."""
+    """Grasps at which the hand picks or places here. The open fingers need free space at each of
+    them."""
     tall: bool = False
-    """Whether it is so high, or will be built so high, that the palm also needs free space."""
+    """Whether the object is so high, or will become so high, that the palm also needs free
+    space."""
 
     @cached_property
     def fingers(self) -> tuple[Polygon, ...]:
-        """The areas of the open fingers and between them, one for each grasp."""
+        """The areas of the open fingers and of the gap between them, one for each grasp."""
         return self._at_grasps(OPEN_FINGERS)
 
     @cached_property
@@ -96,7 +99,7 @@ class Footprint:
 
 @dataclass(frozen=True)
 class Placed:
-    """A footprint in the world."""
+    """A footprint at a pose in the world."""
 
     body: tuple[Polygon, ...]
     fingers: tuple[Polygon, ...]
@@ -104,13 +107,14 @@ class Placed:
     tall: bool
 
     def is_within(self, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> bool:
-        """Whether the body is within an axis-aligned rectangle, given by two corners."""
+        """Whether the body is within the axis-aligned rectangle with the given corners."""
         return all(
             bool((polygon >= lower).all() and (polygon <= upper).all()) for polygon in self.body
         )
 
     def is_clear_of(self, other: Placed, spacing: float) -> bool:
-        """Whether the bodies have this spacing and neither obstructs the hand at the other."""
+        """Whether the bodies are at least `spacing` metres apart and neither obstructs the hand at
+        the other."""
         return (
             _are_apart(self.body, other.body, spacing)
             and _are_apart(self.fingers, other.body, 0.0)
@@ -135,16 +139,17 @@ def draw_poses(
 ) -> list[RigidTransform]:
     """Draws poses with any heading on the table, within the workspace.
 
-    All bodies keep the spacing, and the open hand at each grasp touches only what it grasps.
+    All bodies keep the spacing, and at each grasp the open hand touches only the grasped object.
 
     Args:
-        footprints: the footprints of what to place, in drawing order; put large ones first.
-        grid: the workspace.
+        footprints: the footprints of the bodies to place, in the order in which they are drawn. Put
+            large ones first.
+        grid: pixel grid of the workspace.
         rng: the generator of all random draws.
         spacing: least distance between two bodies, in metres.
 
     Returns:
-        X_W of each.
+        The pose in the world of each footprint.
 
     Raises:
         UserError: no free space was found.
@@ -171,11 +176,12 @@ def draw_in_turn(
     *,
     restarts: int,
 ) -> list[_Found] | None:
-    """Draws places one after another, and starts over if there is none for an item.
+    """Draws places for items one after another, and starts over if there is no place for an item.
 
     Args:
-        items: what to place, in drawing order.
-        draw: returns a place for an item, given the places of earlier items; None if there is none.
+        items: the items to place, in the order in which they are drawn.
+        draw: a function that returns a place for an item, given the places of earlier items; None
+            if there is no place.
         restarts: largest number of attempts.
 
     Returns:

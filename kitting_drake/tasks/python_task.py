@@ -1,4 +1,4 @@
-"""The user's own task, named in a scenario as `module:Class`."""
+"""A user's own task, which a scenario names as `module:Class`."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ def import_task(reference: str, base: Path) -> type[TaskConfig]:
     """Imports the class of a task.
 
     Args:
-        reference: `module:Class`; the module is on Python's path, or in `base`.
+        reference: `module:Class`. The module must be on Python's path or in `base`.
         base: the folder of the scenario's file.
 
     Raises:
-        ValueError: the import fails, or the class is not a task; the message begins with
+        ValueError: the import fails, or the class is not a task. The message begins with
             `task.class`.
     """
     module, _, name = reference.partition(":")
@@ -34,7 +34,7 @@ def import_task(reference: str, base: Path) -> type[TaskConfig]:
     try:
         found = import_own(reference, base)
     except (Exception, SystemExit) as error:
-        # Importing the module may raise anything.
+        # The import of the module may raise any exception.
         reason = f"{type(error).__name__}: {error}"
         raise ValueError(f"task.class: cannot import {reference}: {reason}") from error
     if not (isinstance(found, type) and issubclass(found, TaskConfig)):
@@ -52,9 +52,9 @@ class PythonTask(TaskConfig):
     """
 
     reference: str
-    """`module:Class`."""
+    """The task's class, as `module:Class`."""
     config: TaskConfig
-    """The instance."""
+    """The instance of the task's class."""
     folder: Path = field(default=Path(), metadata={"described": False})
     """The folder of the scenario's file."""
 
@@ -101,7 +101,7 @@ class PythonTask(TaskConfig):
         return self.config.find_cause(scene, index, X_WB, placement, records)
 
     def _sources(self, base: Path) -> list[Path]:
-        """The files of the module or its package, on which results depend."""
+        """The Python files of the module or its package, on which results depend."""
         module = self.modules()[0]
         if beside := files_beside(module, base):
             return beside
@@ -110,7 +110,7 @@ class PythonTask(TaskConfig):
         except ImportError as error:
             raise UserError(f"task.class: {error}") from error
 
-    # Pickled by class name and fields, because its module may exist only beside the scenario.
+    # Pickle the class name and the fields, because the module may exist only beside the scenario.
 
     def __reduce__(self) -> tuple[object, ...]:
         return _restore, (self.reference, vars(self.config), self.folder)

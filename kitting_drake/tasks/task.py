@@ -1,7 +1,7 @@
 """The interface of a task: a dataclass of parameters that makes a Scene from a seed.
 
-A task is a variant of the scenario's `task:` union. Code outside `kitting_drake/tasks/` depends
-only on this interface.
+A scenario's field `task:` holds a task. Code outside `kitting_drake/tasks/` depends only on this
+interface.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ MISPLACED = "misplaced"
 _EMPTY_MODES = ("APPROACH", "DESCEND", "CLOSE")
 
 TABLE = ((0.0, -0.75), (1.0, 0.75))
-"""Lower and upper (x, y) corner of the table in the world, in metres; its top is at z = 0."""
+"""Lower and upper (x, y) corners of the table in the world, in metres. The table's top is at z =
+0."""
 
 
 @dataclass(frozen=True)
@@ -36,21 +37,22 @@ class SceneObject:
     """An object that can be picked."""
 
     name: str
-    """Unique in the scene."""
+    """Name of the object, which must be unique in the scene."""
     category: str
-    """Results are grouped by it."""
+    """Category of the object. Results are grouped by category."""
     model: Path
     """SDFormat file of one free link; its frame is the object's frame B."""
     X_WB: RigidTransform
-    """Initial pose."""
+    """Initial pose of the object in the world."""
     p_BPoints: NDArray[np.float64] = field(repr=False)
-    """(m, 3) surface points, sampled by area, in B, in metres."""
+    """(m, 3) points of the surface, sampled uniformly by area, in B, in metres."""
     grasps: tuple[Grasp, ...] = ()
-    """In B, best first; may be empty if the object can fill no goal."""
+    """The object's grasps in B, best first. They may be missing if the object can fill no goal."""
     symmetry: int = 1
-    """Order of the rotational symmetry about B's z; 1 for none."""
+    """Order of the object's rotational symmetry about B's z axis; 1 for none."""
     axis: tuple[float, float] | None = None
-    """(x, y) of the axis of symmetry in B, in metres; None: the middle of the bounding box."""
+    """(x, y) of the axis of symmetry in B, in metres; None stands for the middle of the bounding
+    box."""
 
 
 @dataclass(frozen=True)
@@ -61,17 +63,18 @@ class Fixture:
     model: Path
     """SDFormat file of one link."""
     X_WF: RigidTransform
-    """Pose of the link's frame."""
+    """Pose of the link's frame F in the world."""
     p_FPoints: NDArray[np.float64] | None = field(default=None, repr=False)
-    """(m, 3) points of its surface in its frame, in metres, that the expert's hand keeps clear of;
-    None: it is never in the way."""
+    """(m, 3) points of the fixture's surface in F, in metres, which the expert's hand avoids; None
+    if the fixture is never in the way."""
 
 
 @dataclass(frozen=True)
 class Arrivals:
     """Objects that appear one at a time during an episode. Until then they are outside the cell.
 
-    The next one appears while the hand retreats or observes and no object's origin is over `area`.
+    The next object appears when the hand retreats or observes and no object's origin is over
+    `area`.
     """
 
     objects: tuple[int, ...]
@@ -79,14 +82,15 @@ class Arrivals:
     poses: tuple[RigidTransform, ...]
     """X_WB at which each object appears, at rest in the air."""
     area: tuple[tuple[float, float], tuple[float, float]]
-    """Lower and upper (x, y) corner in the world, in metres."""
+    """Lower and upper (x, y) corners of the area in the world, in metres."""
 
     def __post_init__(self) -> None:
         assert len(self.objects) == len(self.poses)
 
 
 def waiting_pose(index: int) -> RigidTransform:
-    """X_WB of an object that has not appeared: outside the cell, and out of the cameras' sight."""
+    """X_WB of an object that has not appeared yet. It is outside the cell and out of the cameras'
+    sight."""
     return RigidTransform([-20.0 - index, 0.0, -20.0])
 
 
@@ -97,18 +101,18 @@ class Scene:
     objects: tuple[SceneObject, ...]
     fixtures: tuple[Fixture, ...]
     goals: tuple[Goal, ...]
-    """In the expert's order; the rewards add up to 1."""
+    """The goals, in the order in which the expert fills them. Their rewards add up to 1."""
     success: SuccessPredicate
     max_actions: int
-    """The episode ends after this many actions."""
+    """Number of actions after which the episode ends."""
     arrivals: Arrivals | None = None
-    """Objects that appear later; None: all are present initially."""
+    """Objects that appear later; None if all are present from the beginning."""
     measures: Mapping[str, SuccessPredicate] = field(default_factory=dict)
-    """Other measures of success by name. Results report them beside `success`, and `strict`; they
-    change neither the reward nor the expert."""
+    """Other measures of success, by name. Results report them besides `success` and `strict`. They
+    affect neither the reward nor the expert."""
     laying_area: tuple[tuple[float, float], tuple[float, float]] | None = None
-    """Lower and upper (x, y) corner of the part of the table on which the expert may lay objects
-    that are in the way, in metres; None: objects lie apart, and it never does."""
+    """Lower and upper (x, y) corners, in metres, of the part of the table on which the expert may
+    lay objects that are in the way. None if objects lie apart, so that the expert never does so."""
 
     def __post_init__(self) -> None:
         names = [item.name for item in self.objects] + [item.name for item in self.fixtures]
@@ -127,60 +131,63 @@ class PeakForce:
     object, as means over 1/64 s. See `systems.contact_guard.ContactGuard`."""
 
     vertical: float
-    """In N."""
+    """The vertical force, in N."""
     lateral: float
-    """In N."""
+    """The lateral force, in N."""
     mode: str
-    """The mode of the planner in which the larger of the two rose."""
+    """The mode of the planner in which the larger of the two forces occurred."""
 
 
 @dataclass
 class ActionRecord:
-    """A pick and place and its errors with respect to the expert's. Keys of `results.json`."""
+    """A pick and place, and how far it deviates from the expert's. The fields are keys of
+    `results.json`."""
 
     object: str
-    """The lifted object; if none was lifted, the one nearest to the pick."""
+    """Name of the lifted object. If none was lifted, it is the object nearest to the pick."""
     category: str
     """The object's category."""
     outcome: str
-    """`placed`, `missed` (nothing grasped), `dropped` (lost on the way), `pressed` (pushed down),
-    `stopped` (by a contact force beyond `planner.force_limit`), `set down` (where it was picked,
-    because it would have turned between the pads), `unreachable` (the robot did not move) or
-    `unfinished`."""
+    """The outcome: `placed`, `missed` (nothing was grasped), `dropped` (the object was lost on the
+    way), `pressed` (it was pushed down), `stopped` (a contact force exceeded
+    `planner.force_limit`), `set down` (it was put back where it was picked, because it would have
+    turned between the pads), `unreachable` (the robot did not move) or `unfinished`."""
     pick: PlanarPose
     place: PlanarPose
     pick_position_error_mm: float | None
-    """Distance from the nearest of the object's annotated grasps; None if it has none."""
+    """Distance of the pick from the nearest of the object's annotated grasps, in mm; None if the
+    object has no grasps."""
     pick_angle_error_deg: float | None
-    """Angle from that grasp, modulo half rotations: 0 to 90."""
+    """Angle between the pick and that grasp, modulo half rotations: 0 to 90 degrees."""
     place_position_error_mm: float | None
-    """Distance of the object's middle from its goal after a rigid motion by the action; None if the
-    object can fill no goal."""
+    """Distance between the object's middle and its goal, in mm, if the object moved rigidly with
+    the hand from pick to place; None if the object can fill no goal."""
     place_angle_error_deg: float | None
-    """Heading error after that motion, modulo the object's symmetry: 0 to 180."""
+    """Heading error after that motion, modulo the object's symmetry: 0 to 180 degrees."""
     peak_force_n: PeakForce | None = None
-    """None before the first contact force is known."""
+    """The largest contact force during the action; None before a force is known."""
 
 
 class TaskConfig:
-    """The interface of a task. Each variant of the scenario's `task:` derives from it.
+    """The interface of a task, from which each type of task derives.
 
-    A variant is a dataclass of YAML fields with defaults (see `systems.bounds.bounded`).
+    A task is a dataclass of YAML fields with defaults (see `systems.bounds.bounded`).
     """
 
     causes: tuple[str, ...] = (MISSED_GRASP, SLIPPED, MISPLACED, NEVER_PICKED)
     """The possible results of `find_cause`, in the order of tables."""
     not_perturbed: tuple[str, ...] = ()
-    """Names of `--perturb` that do not apply, because they would change the task."""
+    """Names of perturbations (see `--perturb`) that do not apply, because they would change the
+    task."""
     objects_are_independent: bool = False
-    """Whether placed objects neither support nor obstruct each other. Intervals of rates are then
-    over objects, else over episodes."""
+    """Whether placed objects neither support nor obstruct each other. If so, confidence intervals
+    of rates are computed over objects, otherwise over episodes."""
 
     def make_scene(self, *, grid: PixelGrid, seed: int, base: Path) -> Scene:
-        """Makes the scene of a seed, deterministically.
+        """Makes the scene of a seed. The same seed always gives the same scene.
 
         Args:
-            grid: the workspace. Drawn poses are in it, and on the table.
+            grid: pixel grid of the workspace. Random poses lie inside it and on the table.
             seed: the seed of all draws.
             base: base folder of relative paths.
 
@@ -191,16 +198,17 @@ class TaskConfig:
 
     @property
     def title(self) -> str:
-        """The task's name in results. With default parameters it is the name in the literature."""
+        """The task's name in results. With default parameters it is the task's name in the
+        literature."""
         raise NotImplementedError
 
     @property
     def learning(self) -> Learning:
-        """Properties of the task that learning may assume."""
+        """Assumptions about the task that training may make."""
         return Learning()
 
     def input_files(self, base: Path) -> list[Path]:
-        """The files on which the scenes depend, except for the project's own.
+        """The files on which the scenes depend, except for files of the project.
 
         Raises:
             UserError: a file is missing.
@@ -215,7 +223,8 @@ class TaskConfig:
         """Checks the constraints that types and ranges cannot express.
 
         Raises:
-            ValueError: a field violates one. The message begins with its path, `task.x`.
+            ValueError: a field violates a constraint. The message begins with the field's path,
+                such as `task.kit`.
         """
 
     def find_cause(
@@ -226,12 +235,12 @@ class TaskConfig:
         placement: Placement,
         records: Sequence[ActionRecord],
     ) -> str:
-        """Why an object is not a success: one of `causes`.
+        """The reason why an object does not fill its goal, one of `causes`.
 
         Args:
             scene: the scene of the episode.
-            index: the index of the object.
-            X_WB: final poses of all objects.
+            index: index of the object among the scene's objects.
+            X_WB: final poses of all objects in the world.
             placement: the placement of the object.
             records: the episode's actions.
         """
@@ -242,7 +251,8 @@ class TaskConfig:
 
 
 def last_action_on(name: str, records: Sequence[ActionRecord]) -> ActionRecord | str:
-    """The last action that held an object; if there is none, the cause."""
+    """The last action in which the hand held an object. If there is none, the cause of the
+    failure."""
     grasped = [item for item in records if item.outcome not in ("unfinished", "pressed")]
     own = [item for item in grasped if item.object == name]
     held = [item for item in own if item.outcome != "missed" and not _stopped_empty(item)]
@@ -252,6 +262,6 @@ def last_action_on(name: str, records: Sequence[ActionRecord]) -> ActionRecord |
 
 
 def _stopped_empty(record: ActionRecord) -> bool:
-    """Whether the force guard stopped the hand before it grasped."""
+    """Whether the force guard stopped the hand before it grasped an object."""
     peak = record.peak_force_n
     return record.outcome == "stopped" and peak is not None and peak.mode in _EMPTY_MODES

@@ -276,7 +276,7 @@ def test_saves_a_picture_of_each_decision(
     ("content", "sentence"),
     [
         (None, "cannot read the weights {weights}: there is no such file"),
-        ("text", "cannot read the weights {weights}: it is not a whole safetensors file"),
+        ("text", "cannot read the weights {weights}: it is not a complete safetensors file"),
         ("foreign", "{weights} is a safetensors file, but not a policy of this program"),
     ],
 )

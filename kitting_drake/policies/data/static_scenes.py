@@ -185,14 +185,14 @@ def _check(heights: NDArray, actions: NDArray, first: NDArray, grid: PixelGrid) 
         raise ValueError(f"its actions must be rows of 8 numbers, not {actions.shape}")
     bounds = first.shape == (len(heights) + 1,) and first.dtype.kind in "iu"
     if not bounds or first[0] != 0 or first[-1] != len(actions) or (np.diff(first) < 0).any():
-        raise ValueError("`first` does not divide the actions among the scenes")
+        raise ValueError("its dataset `first` does not assign each action to one scene")
 
 
 def _check_batches(ends: NDArray, count: int) -> None:
     """Raises ValueError unless `ends` divides the scenes into batches."""
     whole = ends.ndim == 1 and ends.dtype.kind in "iu" and len(ends) > 0
     if not whole or ends[-1] != count or (np.diff(ends) <= 0).any():
-        raise ValueError("`batch_ends` does not divide the scenes into batches")
+        raise ValueError("its dataset `batch_ends` does not assign each scene to one batch")
 
 
 class StaticSamples(Sequence[LabelledImage]):

@@ -241,7 +241,7 @@ def _read(path: Path, *, tensors: bool) -> tuple[dict[str, str], dict[str, Tenso
             names = file.keys() if tensors else []
             content = {name: file.get_tensor(name) for name in names}
     except (OSError, SafetensorError) as error:
-        reason = getattr(error, "strerror", None) or "it is not a whole safetensors file"
+        reason = getattr(error, "strerror", None) or "it is not a complete safetensors file"
         if isinstance(error, FileNotFoundError):
             reason = "there is no such file"
         raise UserError(f"cannot read the weights {path}: {reason}") from error

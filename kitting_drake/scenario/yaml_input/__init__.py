@@ -1,1 +1,1 @@
-"""YAML: parsed, and checked against a schema of dataclasses."""
+"""Parses YAML and checks it against a schema of dataclasses."""

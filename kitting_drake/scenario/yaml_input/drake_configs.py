@@ -1,4 +1,4 @@
-"""Drake's own configs as fields of a scenario."""
+"""Support for Drake's own configs as fields of a scenario."""
 
 import copyreg
 from typing import Any
@@ -12,7 +12,8 @@ DRAKE_CONFIGS = (CameraConfig, MeshcatParams, MultibodyPlantConfig)
 
 
 def struct_fields(schema: Any) -> dict[str, Any] | None:
-    """The fields of a struct of Drake's, by name, with their types; None for any other type."""
+    """The types of the fields of one of Drake's structs, by the field's name; None for any other
+    type."""
     fields = getattr(schema, "__fields__", None)
     return None if fields is None else {item.name: item.type for item in fields}
 
@@ -25,6 +26,6 @@ def _reduce(config: Any) -> tuple[Any, ...]:
     return _load, (type(config), yaml_dump_typed(config))
 
 
-# They do not pickle by themselves, and scenarios go to worker processes.
+# Make the configs picklable, because scenarios are sent to worker processes.
 for _config in DRAKE_CONFIGS:
     copyreg.pickle(_config, _reduce)

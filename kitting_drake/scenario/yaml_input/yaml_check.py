@@ -18,16 +18,16 @@ _NAMES = {float: "a number", int: "a whole number", bool: "true or false", str: 
 
 
 def check_yaml(schema: Any, value: Any, where: str) -> None:
-    """Checks what `pydrake.common.yaml.yaml_load` returned against a type of the schema.
+    """Checks a value that `pydrake.common.yaml.yaml_load` returned against a type of the schema.
 
     Args:
         schema: a dataclass, a config of Drake's, a union of these, `T | None`, float, int, bool,
             str, Path, `list[T]` or `dict[str, T]`.
-        value: the untyped value; a mapping's YAML tag is its key `_tag`.
+        value: the untyped value. The YAML tag of a mapping is under its key `_tag`.
         where: the path to the value, for messages; empty at the root.
 
     Raises:
-        ValueError: the value does not fit. The message begins with its path.
+        ValueError: the value does not fit the type. The message begins with the value's path.
     """
     origin = typing.get_origin(schema)
     if origin in (types.UnionType, typing.Union):
@@ -64,7 +64,7 @@ def _check_union(schema: Any, value: Any, where: str) -> None:
         return
     if not isinstance(value.get("_tag", ""), str):
         raise ValueError(f"{where} has a tag that is not a name: {_shown(value['_tag'])}")
-    # An untagged mapping takes the first option, as in Drake.
+    # As in Drake, an untagged mapping has the first type of the union.
     tag = str(value.get("_tag", options[0].__name__)).lstrip("!")
     for option in options:
         if option.__name__ == tag:
@@ -81,7 +81,7 @@ def _check_dataclass(schema: Any, value: Any, where: str) -> None:
     if not isinstance(value, dict):
         raise ValueError(f"{where or 'the scenario'} must be a mapping, not {_shown(value)}")
     types_by_name = typing.get_type_hints(schema)
-    # A class may also annotate attributes that are not fields.
+    # Use only the dataclass fields, because a class may also annotate other attributes.
     hints = {item.name: types_by_name[item.name] for item in dataclasses.fields(schema)}
     _check_names(hints, value, where)
     for key, item in value.items():
@@ -90,7 +90,8 @@ def _check_dataclass(schema: Any, value: Any, where: str) -> None:
 
 
 def _check_struct(schema: Any, value: Any, where: str) -> None:
-    """Checks the names and the plain values of a struct of Drake's, which checks the others."""
+    """Checks the names and the plain values of one of Drake's structs. Drake checks the other
+    values."""
     hints = struct_fields(schema) or {}
     if not isinstance(value, dict):
         raise ValueError(f"{where} must be a mapping, not {_shown(value)}")

@@ -1,4 +1,4 @@
-"""Parses YAML with errors that a person understands, and writes what Drake reads."""
+"""Parses YAML with readable error messages, and writes YAML for Drake."""
 
 import copy
 import functools
@@ -9,17 +9,18 @@ from pydrake.common.yaml import yaml_load
 
 from kitting_drake.common.errors import UserError
 
-# libyaml composes several times as fast.
+# Use libyaml if it is available, because it is several times as fast.
 _Composer = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 _TEXT, _MERGE = "tag:yaml.org,2002:str", "tag:yaml.org,2002:merge"
 
 
 class _Dumper(yaml.SafeDumper):
-    """Writes what Drake's `yaml_load` reads: the tag of a mapping is under `_tag`."""
+    """Writes mappings as Drake's `yaml_load` returns them, with a mapping's tag under its key
+    `_tag`."""
 
     def ignore_aliases(self, data: Any) -> bool:
-        """Writes the same mapping again, not a reference to it."""
+        """Returns True, so that a repeated mapping is written again instead of as a reference."""
         return True
 
 
@@ -32,7 +33,8 @@ _Dumper.add_representer(dict, _represent_tagged)
 
 
 def dumped(raw: dict) -> str:
-    """The YAML of a mapping in its own order, which matters for paints: the last match wins.
+    """Converts a mapping to YAML and keeps its order, which matters for paints: the last match
+    wins.
 
     Drake's `yaml_dump` would sort it.
     """
@@ -40,14 +42,14 @@ def dumped(raw: dict) -> str:
 
 
 def parse(content: str, where: str) -> dict:
-    """The mapping that a text holds; anchors, aliases and merge keys (`<<`) are resolved.
+    """Parses a text that holds a mapping. Anchors, aliases and merge keys (`<<`) are resolved.
 
     Args:
         content: the text.
-        where: what to call it in errors.
+        where: name of the text in error messages.
 
     Raises:
-        UserError: it is not YAML, or not a mapping of names.
+        UserError: the text is not YAML, or not a mapping of names.
     """
     try:
         root = copy.deepcopy(_checked(content))
@@ -67,21 +69,21 @@ def parse(content: str, where: str) -> dict:
     return root
 
 
-# Benchmarks load one file hundreds of times.
+# Cache the result, because benchmarks load one file hundreds of times.
 @functools.lru_cache(maxsize=64)
 def _checked(content: str) -> Any:
-    """The content of a text. It is cached, so callers must not change it."""
+    """Parses and checks a text. The result is cached, so callers must not change it."""
     # Check for repeated fields here: a Python mapping would keep only the last.
     try:
         node = yaml.compose(content, Loader=_Composer)
     except yaml.YAMLError:
-        # Its errors are clearer.
+        # Parse it again with PyYAML's own parser, whose error messages are clearer.
         node = yaml.compose(content, Loader=yaml.SafeLoader)
     _check_names(node)
     # Drake's loader would drop such a tag without a warning.
     if isinstance(node, yaml.MappingNode) and node.tag != "tag:yaml.org,2002:map":
         raise ValueError(f"the tag {node.tag} at the beginning has no effect: remove it")
-    # Drake treats an empty text as if none were given.
+    # Do not pass an empty text to Drake, which would treat it as a missing argument.
     return yaml_load(data=content) if content.strip() else None
 
 

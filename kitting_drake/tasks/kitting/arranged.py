@@ -26,7 +26,7 @@ from systems.signals import PixelGrid
 class ArrangedKitting(KittingTask):
     """Tools and kit in given poses. The oracle takes the tools in the given order."""
 
-    # Tools by name or path, with their poses on the table.
+    # The tools, by name or path, with their poses on the table.
     tools: dict[str, TablePose] = field(
         default_factory=lambda: {"claw_hammer": TablePose(x=0.35, y=0.3, yaw_deg=90.0)}
     )

@@ -1,4 +1,4 @@
-"""Tools without files as convex pieces, so that they can settle by physics."""
+"""Divides tools that have no model files into convex pieces, so that they can be simulated."""
 
 import itertools
 
@@ -12,19 +12,21 @@ from kitting_drake.hkd.tools.tool import Tool
 from kitting_drake.tasks.kitting.settling import ConvexBody
 
 _SLAB = 0.02
-"""Greatest thickness of the slabs along x into which a tool is cut, in metres."""
+"""Largest thickness of the slabs along x into which a tool is cut, in metres."""
 _LEAST_VOLUME = 1e-9
-"""Smaller pieces are left out, in m^3."""
+"""Pieces with a smaller volume are left out, in m^3."""
 _THINNED_MM = 0.2
-"""Tolerance of the pieces' corners, in mm."""
+"""Corners of pieces are moved by up to this to simplify the pieces, in mm."""
 _MASS = 0.1
-"""The mass of a tool that has none, in kg. The resting pose hardly depends on it."""
+"""The mass that is assumed for a tool without a mass, in kg. The resting pose hardly depends on
+it."""
 
 
 def convex_body(tool: Tool) -> ConvexBody:
-    """A tool cut into slabs along its length; each connected part of a slab is a convex piece.
+    """Cuts a tool into slabs along its length. Each connected part of a slab becomes a convex
+    piece.
 
-    Pieces are convex hulls: notches along a slab, narrower than it is thick, are filled.
+    Pieces are convex hulls, so notches that are narrower than a slab is thick are filled.
     """
     mesh = trimesh.Trimesh(
         tool.triangles.reshape(-1, 3), np.arange(3 * len(tool.triangles)).reshape(-1, 3)
@@ -54,5 +56,6 @@ def convex_body(tool: Tool) -> ConvexBody:
 
 
 def _thinned(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(m, 3) the corners of a hull without slivers, on which contact fails."""
+    """(m, 3) the corners of a convex hull, simplified so that it has no thin slivers, which break
+    contact computations."""
     return thinned(1e3 * points, _THINNED_MM) / 1e3

@@ -1,4 +1,4 @@
-"""Finds why a tool was not kitted, from true poses, which policies cannot see."""
+"""Finds the cause why a tool was not kitted, from true poses, which policies cannot see."""
 
 import math
 from collections.abc import Sequence
@@ -25,13 +25,14 @@ REVERSED = "reversed"
 CAUSES = (MISSED_GRASP, SLIPPED, BLOCKED, WRONG_CAVITY, REVERSED, MISPLACED, NEVER_PICKED)
 
 _NEAR = 0.030
-"""Within this distance a tool is over a cavity, in m; half the distance of two cavities."""
+"""A tool within this distance of a cavity counts as over it, in m. It is half the distance between
+two cavities."""
 _BORDER = 0.015
-"""Width of the kit's border around the tools, in m."""
+"""Width of the kit's border around the seated tools, in m."""
 _ALIGNED = math.radians(20.0)
-"""Largest heading difference of a tool that lies along a cavity."""
+"""Largest difference of heading, in radians, at which a tool counts as lying along a cavity."""
 _TILTED = math.radians(60.0)
-"""A tool tilted further than this lies on the wrong side."""
+"""A tool tilted by more than this lies on the wrong side, in radians."""
 
 
 def find_cause(
@@ -41,20 +42,20 @@ def find_cause(
     placement: Placement,
     records: Sequence[ActionRecord],
 ) -> str:
-    """Why a tool was not placed: one of `CAUSES`.
+    """The cause why a tool was not placed, one of `CAUSES`.
 
-    - `never picked`: no action on it was completed.
-    - `missed grasp`: no grasp of it held.
-    - `reversed`: at its cavity, but rotated by 180 degrees or on the wrong side.
-    - `insertion blocked`: over its cavity, but protruding or displaced.
-    - `slipped`: lost on the way, or left outside the kit by a correct action.
-    - `wrong cavity`: over another tool's cavity.
-    - `misplaced`: anywhere else.
+    - `never picked`: no action on the tool was completed.
+    - `missed grasp`: no grasp of the tool held.
+    - `reversed`: the tool is at its cavity, but rotated by 180 degrees or on the wrong side.
+    - `insertion blocked`: it is over its cavity, but protrudes or is displaced.
+    - `slipped`: it was lost on the way, or left outside the kit by a correct action.
+    - `wrong cavity`: it is over another tool's cavity.
+    - `misplaced`: it is anywhere else.
 
     Args:
         scene: the scene of the episode.
         index: the index of the tool among the scene's objects.
-        X_WB: its final pose.
+        X_WB: final pose of the tool.
         placement: the placement of the tool, with respect to the goal assigned to it.
         records: the episode's actions.
     """
@@ -67,9 +68,10 @@ def find_cause(
     if goal is not None:
         X_WGoal = goal.poses[placement.pose]
         grasp_point = np.array([item.grasps[0].x, item.grasps[0].y, 0.0])
-        # Half a rotation about the grasp displaces the middle, but not the grasp.
+        # Compare the grasp point as well: half a rotation about the grasp displaces the tool's
+        # middle, but not the grasp.
         if min(_gap(X_WB, X_WGoal, middle), _gap(X_WB, X_WGoal, grasp_point)) < _NEAR:
-            # Modulo the tool's symmetry: a symmetric tool cannot be reversed.
+            # The error is modulo the tool's symmetry, so a symmetric tool cannot be reversed.
             rotation = abs(placement.angle_error)
             if rotation > math.pi - _ALIGNED or _tilt(X_WB) > _TILTED:
                 return REVERSED
@@ -86,7 +88,7 @@ def find_cause(
 
 
 def _gap(X_WB: RigidTransform, X_WGoal: RigidTransform, point: np.ndarray) -> float:
-    """Horizontal distance of a body-fixed point (3) from its place at the goal, in m."""
+    """Horizontal distance of a body-fixed point (3) from its position at the goal, in m."""
     return float(np.linalg.norm((X_WB @ point - X_WGoal @ point)[:2]))
 
 
@@ -102,12 +104,13 @@ def _is_over(p_WMiddle: np.ndarray, X_WB: RigidTransform, X_WGoal: RigidTransfor
 
 
 def _is_over_kit(scene: Scene, p_WPoint: np.ndarray) -> bool:
-    """Whether a point is over a kit, i.e. the bounding box of all seated tools in its frame."""
+    """Whether a point is over any kit, which is the bounding box of all its seated tools plus a
+    border."""
     return any(_is_over_one(scene, kit, p_WPoint) for kit in {goal.fixture for goal in scene.goals})
 
 
 def _is_over_one(scene: Scene, kit: int, p_WPoint: np.ndarray) -> bool:
-    """Whether a point is over one kit, given as an index into the scene's fixtures."""
+    """Whether a point is over one kit, given by its index among the scene's fixtures."""
     X_KW = scene.fixtures[kit].X_WF.inverse()
     seated = np.concatenate(
         [

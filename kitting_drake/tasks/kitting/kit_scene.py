@@ -1,4 +1,4 @@
-"""The scene of kits and their tools."""
+"""Makes the scene of kits and their tools."""
 
 import re
 from collections.abc import Sequence
@@ -18,14 +18,14 @@ _SURFACE_POINTS = 2000
 
 @dataclass(frozen=True)
 class PosedKit:
-    """A kit at a pose."""
+    """A kit at a pose, and the tools that belong to it."""
 
     kit: Kit
     X_WKit: RigidTransform
     members: tuple[int, ...]
-    """The kit's tools, as indices into the task's."""
+    """Indices of the kit's tools among the task's tools."""
     riser: Fixture | None = None
-    """The riser under it."""
+    """The riser under the kit; None if there is none."""
 
 
 def kitting_scene(
@@ -40,11 +40,11 @@ def kitting_scene(
     Identical tools may fill each other's cavities, in any kit.
 
     Args:
-        kits: the kits; each tool is a member of one.
+        kits: the kits; each tool belongs to one of them.
         tools: the tools.
         X_WTools: the initial pose of each tool.
-        order: the expert's order, as indices into the tools.
-        threshold: the threshold of ADD-S, in metres.
+        order: indices of the tools in the order in which the expert takes them.
+        threshold: largest ADD-S of a success, in metres.
     """
     sorted_tools = [tools[index] for index in order]
     fixtures = (
@@ -120,7 +120,7 @@ def _unique_names(tools: Sequence[Tool], taken: set[str]) -> list[str]:
     names: list[str] = []
     for tool in tools:
         name, number = tool.name, 2
-        # Other bodies in the scene have these names.
+        # Avoid the names of other bodies in the scene.
         while name in names or name in taken or re.fullmatch(r"distractor_\d+", name):
             name, number = f"{tool.name}_{number}", number + 1
         names.append(name)

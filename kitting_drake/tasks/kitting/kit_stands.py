@@ -1,4 +1,4 @@
-"""Kits on risers, and tilted kits."""
+"""Risers under kits, and tilts of kits."""
 
 import hashlib
 import math
@@ -18,7 +18,8 @@ from systems.bounds import bounded
 
 MOST_TILT_DEG = 10.0
 MOST_RISER = 0.06
-"""In metres. A higher kit would touch the palm over a neighbouring kit on the table."""
+"""Largest height of a riser, in metres. On a higher one, a kit could touch the palm when the hand
+works at a neighbouring kit on the table."""
 
 _FILE = "riser.sdf"
 _RISER = """<?xml version="1.0"?>
@@ -49,36 +50,38 @@ _RISER = """<?xml version="1.0"?>
 
 @dataclass
 class KitPose(TablePose):
-    """A kit's pose: on the table or on a riser, level or tilted."""
+    """A kit's pose, on the table or on a riser, level or tilted."""
 
     # Height of the riser under the kit, in m.
     riser: float = bounded(0.0, 0.0, MOST_RISER)
 
-    # Rotation about the kit's own x and y, in degrees. The kit's lowest edge is on the riser.
+    # Rotation about the kit's own x and y axes, in degrees. The kit's lowest edge lies on the
+    # riser.
     roll_deg: float = bounded(0.0, -MOST_TILT_DEG, MOST_TILT_DEG)
     pitch_deg: float = bounded(0.0, -MOST_TILT_DEG, MOST_TILT_DEG)
 
 
 @dataclass(frozen=True)
 class KitStand:
-    """A riser and a tilt under a kit."""
+    """The riser under a kit, and the kit's tilt."""
 
     riser: float
     """Height of the riser, in metres; 0 for none."""
     R_KLevelK: RotationMatrix
-    """The tilt: the rotation from the level kit's frame."""
+    """The tilt, as the orientation of the tilted kit K in the frame of the level kit."""
 
     @property
     def is_level(self) -> bool:
-        """Whether there is no tilt."""
+        """Whether the kit is not tilted."""
         return self.R_KLevelK.IsNearlyIdentity(1e-12)
 
     def margin(self, kit: Kit) -> float:
-        """How far the tilted block reaches beyond its level outline, in metres, at most."""
+        """How far the tilted block extends beyond the outline of the level block at most, in
+        metres."""
         return 0.0 if self.is_level else float(self._corners(kit)[:, :2].max(initial=0.0))
 
     def lifted(self, kit: Kit, X_WLevel: RigidTransform) -> RigidTransform:
-        """X_WKit of a kit at a level pose on the table, put on this stand."""
+        """X_WKit of a kit on this stand, if X_WLevel is its pose on the table without a stand."""
         if self.is_level:
             if not self.riser:
                 return X_WLevel
@@ -93,7 +96,7 @@ class KitStand:
         return X_WLevel @ RigidTransform(self.R_KLevelK, [0, 0, self.riser - lowest])
 
     def fixture(self, name: str, kit: Kit, X_WLevel: RigidTransform) -> Fixture | None:
-        """The riser under a kit; None for none."""
+        """The riser under a kit as a fixture; None if there is no riser."""
         if not self.riser:
             return None
         length, width, _ = kit.size
@@ -110,7 +113,7 @@ class KitStand:
 
 
 def stand_of(pose: TablePose) -> KitStand:
-    """The stand of a kit at a pose."""
+    """The stand that a kit's pose describes."""
     if not isinstance(pose, KitPose):
         return KitStand(0.0, RotationMatrix())
     tilt = RollPitchYaw(math.radians(pose.roll_deg), math.radians(pose.pitch_deg), 0)
@@ -121,8 +124,8 @@ def draw_stand(riser: list[float], tilt_deg: list[float], rng: np.random.Generat
     """Draws a stand: the riser's height, the tilt, and the tilt's direction.
 
     Args:
-        riser: least and greatest height, in metres.
-        tilt_deg: least and greatest tilt, in degrees.
+        riser: smallest and largest height of the riser, in metres.
+        tilt_deg: smallest and largest tilt, in degrees.
         rng: the generator of all random draws.
     """
     height = float(rng.uniform(riser[0], riser[1]))
@@ -135,7 +138,8 @@ def draw_stand(riser: list[float], tilt_deg: list[float], rng: np.random.Generat
 
 
 def _riser_model(size: tuple[float, float, float]) -> Path:
-    """The SDFormat file of a riser, in the cache; its frame is in the middle of its bottom."""
+    """Writes the SDFormat file of a riser to the cache and returns its path. The riser's frame is
+    in the middle of its bottom."""
     text = _RISER.format(middle=size[2] / 2, size=" ".join(f"{side:.6g}" for side in size))
     folder = cached_folder(
         cache_directory() / "boxes" / hashlib.sha256(text.encode()).hexdigest()[:24],

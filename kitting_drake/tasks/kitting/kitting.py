@@ -1,4 +1,4 @@
-"""The kitting tasks: tools, kits, their poses and goals."""
+"""The kitting tasks, which put hand tools into the cavities of kits."""
 
 import dataclasses
 import itertools
@@ -46,14 +46,15 @@ from systems.signals import PixelGrid
 
 _MOST_KITS = 4
 _JAW_MARGIN = 0.012
-"""The open jaws are wider than a scaled tool by this, in metres."""
+"""The open jaws must be wider than a scaled tool by at least this, in metres."""
 
 SEEN = "kitting-seen-toolset"
 UNSEEN = "kitting-unseen-toolsets"
-"""The paper's task with unseen toolsets (section V-B.1)."""
+"""Title of the paper's task with unseen toolsets (section V-B.1)."""
 
 _TITLES = {"train": "kitting-train-toolsets", "test": UNSEEN, "fresh": "kitting-fresh-toolsets"}
-"""Titles of the tasks that draw toolsets, by split, if all other parameters are default."""
+"""For each split, the title of the task that draws toolsets from it, if all other parameters have
+their defaults."""
 
 
 @dataclass
@@ -63,10 +64,10 @@ class KittingTask(TaskConfig):
     # The kit block and its cavities.
     kit: KitParameters = field(default_factory=KitParameters)
 
-    # Actions per tool; the paper's tasks allow one.
+    # Number of actions allowed per tool; the paper's tasks allow one.
     tries: int = bounded(1, 1, 10)
 
-    # ADD-S below this is a success (section IV-C of the paper), in m.
+    # A tool is placed if its ADD-S is below this, in m (section IV-C of the paper).
     success_threshold: float = bounded(0.0035, 1e-6, 1.0)
 
     causes = diagnosis.CAUSES
@@ -87,7 +88,7 @@ class KittingTask(TaskConfig):
         return diagnosis.find_cause(scene, index, X_WB[index], placement, records)
 
     def fitted(self, tools: Sequence[Tool]) -> list[Tool]:
-        """The tools with the collision geometry that the kit's clearance needs.
+        """Gives the tools the collision geometry that the kit's clearance requires.
 
         Raises:
             UserError: a tool's surface is not closed.
@@ -97,7 +98,7 @@ class KittingTask(TaskConfig):
         return [fine_tool(tool, self.kit.closing_radius) for tool in tools]
 
     def kit_of(self, tools: Sequence[Tool]) -> Kit:
-        """The kit of some tools; raises UserError if there is none."""
+        """Makes the kit of some tools. Raises UserError if they do not fit into one."""
         try:
             return make_kit(tools, self.kit.with_fine_walls())
         except UserError as error:
@@ -111,49 +112,53 @@ class _DrawnKitting(KittingTask):
     # Least distance between tools and kit, in m.
     spacing: float = bounded(0.008, 0.0, 0.2)
 
-    # Tools and kit are rotated by random angles in plus or minus this, in degrees.
+    # Tools and kit are rotated by random angles between minus and plus this, in degrees.
     yaw_range_deg: float = bounded(180.0, 0.0, 180.0)
 
-    # Whether the oracle takes the tools in random order; else as listed.
+    # Whether the oracle takes the tools in random order. If not, it takes them in the listed order.
     random_order: bool = True
 
-    # Number of boxes without a cavity, as clutter; fewer if there is no room.
+    # Number of boxes without a cavity that lie on the table as clutter. There are fewer if there is
+    # no room.
     distractors: int = bounded(0, 0, 12)
 
-    # Each tool's mass is drawn from this range, in kg; [0, 0]: it has its own.
+    # Range from which each tool's mass is drawn, in kg. With [0, 0] tools have their own masses.
     tool_mass: list[float] = bounded([0.0, 0.0], 0.0, 3.0)
 
-    # Number of kits. The tools are shared out between them at random, as evenly as possible.
+    # Number of kits. The tools are distributed among them at random, as evenly as possible.
     kits: int = bounded(1, 1, _MOST_KITS)
 
-    # Each kit is on a riser of a height drawn from this range, in m.
+    # Range from which the height of the riser under each kit is drawn, in m.
     riser: list[float] = bounded([0.0, 0.0], 0.0, MOST_RISER)
 
-    # Each kit is tilted by an angle drawn from this range, in degrees, in any direction.
+    # Range from which the tilt of each kit is drawn, in degrees. The direction of the tilt is
+    # random.
     tilt_deg: list[float] = bounded([0.0, 0.0], 0.0, MOST_TILT_DEG)
 
     # How the tools lie at the start: apart, touching (side by side, 0 to 3 mm apart), crossed (one
-    # across another), leaning (half of them on the kit block's sides), or heap (fallen from about
-    # 150 mm). All but apart come to rest by physics.
+    # across another), leaning (half of them against the kit block's sides), or heap (fallen from
+    # about 150 mm). Except for apart, a simulation lets the tools come to rest.
     start: str = APART
 
     # Whether the tools start in a shallow tray.
     tray: bool = False
 
-    # as_drawn: all tools rest on the face that lies down in their cavities. any: in a heap, tools
-    # may come to rest on another face.
+    # The face on which tools may lie. as_drawn: all tools lie on the face that is at the bottom in
+    # their cavities. any: in a heap, tools may come to rest on another face.
     faces: str = "as_drawn"
 
     @property
     def not_perturbed(self) -> tuple[str, ...]:  # type: ignore[override]
-        """Boxes are drawn only around tools that lie apart on the table."""
+        """Names of `--perturb` that do not apply: there are distractor boxes only if the tools lie
+        apart on the table."""
         return () if self.start == APART and not self.tray else ("distractors",)
 
     def _draw_scene(self, tools: list[Tool], grid: PixelGrid, seed: int) -> Scene:
         tools = self.fitted(self._weighted(tools, seed))
         if self.start != APART or self.tray:
             return self._draw_settled(self.kit_of(tools), tools, grid, seed)
-        # Streams of their own: with one level kit, the poses are those of a seed without them.
+        # Use separate random streams, so that with one level kit the poses do not depend on these
+        # parameters.
         shares = self._shares(len(tools), np.random.default_rng([seed, 6]))
         kits = [self.kit_of([tools[index] for index in share]) for share in shares]
         stand_rng = np.random.default_rng([seed, 7])
@@ -200,7 +205,7 @@ class _DrawnKitting(KittingTask):
         )
 
     def _weighted(self, tools: list[Tool], seed: int) -> list[Tool]:
-        """The tools with their drawn masses. Identical tools have the same mass."""
+        """Gives the tools their random masses. Identical tools have the same mass."""
         least, greatest = self.tool_mass
         if not greatest:
             return tools
@@ -211,7 +216,7 @@ class _DrawnKitting(KittingTask):
         return [weighted_tool(tool, drawn[tool.directory, tool.length]) for tool in tools]
 
     def _shares(self, count: int, rng: np.random.Generator) -> list[tuple[int, ...]]:
-        """The tools of each kit, as indices."""
+        """Indices of the tools of each kit."""
         if count < self.kits:
             raise UserError(f"task.kits is {self.kits}, but there are only {count} tools")
         if count > MOST_TOOLS * self.kits:
@@ -258,15 +263,20 @@ class _DrawnKitting(KittingTask):
         if (self.start != APART or self.tray) and (
             self.kits > 1 or any(self.riser + self.tilt_deg)
         ):
-            raise ValueError("task.kits, riser and tilt_deg need task.start: apart, without a tray")
+            raise ValueError(
+                "task.kits, task.riser and task.tilt_deg can be set only if task.start is apart "
+                "and task.tray is false"
+            )
 
 
 @dataclass
 class Kitting(_DrawnKitting):
-    """A kit and its tools in random poses: kitting-seen-toolset."""
+    """A kit and its tools in random poses. With default parameters it is the paper's task
+    kitting-seen-toolset."""
 
-    # 1 to 12 tools for each kit, repetitions allowed: names under models/tools, paths of tool
-    # folders, or simple parts such as ring_40x20x10 (docs/sizes.md).
+    # The tools, 1 to 12 for each kit, with repetitions if you like: names of folders in
+    # models/tools, paths of other tool folders, or simple parts such as ring_40x20x10
+    # (docs/sizes.md).
     tools: list[str] = field(
         default_factory=lambda: [
             "claw_hammer",
@@ -295,22 +305,25 @@ class Kitting(_DrawnKitting):
 
 @dataclass
 class ToolsetKitting(_DrawnKitting):
-    """Random tools from a pool, and their kit, in random poses: kitting-unseen-toolsets."""
+    """Random tools from a pool, and their kit, in random poses. With default parameters it is the
+    paper's task kitting-unseen-toolsets."""
 
-    # The pool: train or test (section IV-B.1 of the paper), or fresh, which is disjoint from both.
+    # The pool of tools: train or test (section IV-B.1 of the paper), or fresh, which shares no
+    # tools with them.
     split: str = "test"
 
-    # Alternatively, a custom pool of names or paths of tool folders, or of kinds of simple parts
-    # such as ring (docs/sizes.md). One of each category is drawn.
+    # A custom pool that replaces the split: names or paths of tool folders, or kinds of simple
+    # parts such as ring (docs/sizes.md). One tool of each category is drawn.
     pool: list[str] = field(default_factory=list)
 
-    # Draw this many tools from all of the pool or split, whatever their categories; 0: one of each
-    # category. None occurs twice unless the pool is too small.
+    # Number of tools to draw from the whole pool or split, regardless of their categories. With 0,
+    # one tool of each category is drawn. No tool occurs twice unless the pool is too small.
     count: int = bounded(0, 0, MOST_TOOLS * _MOST_KITS)
 
-    # Whether to draw tool lengths from the range tool_length, in m (section IV-B.2). If not, tools
-    # have their own lengths. A tool that would be too wide for the jaws, too high for the kit or
-    # heavier than 3 kg is made as long as it may be. Parts also get random proportions.
+    # Whether to scale tools to random lengths from the range tool_length, in m (section IV-B.2 of
+    # the paper). If not, tools keep their own lengths. If a tool would become too wide for the
+    # jaws, too high for the kit or heavier than 3 kg, it gets the largest allowed length. Simple
+    # parts also get random proportions.
     random_lengths: bool = True
     tool_length: list[float] = bounded([0.15, 0.20], 0.015, 0.35)
 
@@ -330,7 +343,8 @@ class ToolsetKitting(_DrawnKitting):
         return self._draw_scene(tools, grid, seed)
 
     def _draw_names(self, seed: int, base: Path) -> list[str]:
-        # Separate streams: the poses depend neither on the number of toolsets nor on lengths.
+        # Use separate random streams, so that the poses depend neither on the number of toolsets
+        # nor on the lengths.
         rng = np.random.default_rng([seed, 1])
         if not self.count:
             choices = self._toolsets(base)
@@ -340,7 +354,8 @@ class ToolsetKitting(_DrawnKitting):
         return [pool[i] for _ in range(rounds) for i in rng.permutation(len(pool))][: self.count]
 
     def _drawn_lengths(self, names: list[str], seed: int, base: Path) -> list[Tool]:
-        """The tools with random lengths; parts also have random proportions."""
+        """Loads the tools and gives them random lengths. Simple parts also get random
+        proportions."""
         least, greatest = self.tool_length
         lengths = np.random.default_rng([seed, 2]).uniform(least, greatest, len(names))
         shapes = np.random.default_rng([seed, 8]).uniform(size=(len(names), 2))
@@ -377,7 +392,8 @@ class ToolsetKitting(_DrawnKitting):
 
 
 def _longest(tool: Tool, kit: KitParameters) -> float:
-    """The greatest length to which a tool can be scaled and still be held and kitted, in metres."""
+    """The largest length to which a tool can be scaled so that it can still be held and kitted, in
+    metres."""
     factor = min(
         (MAX_OPENING - _JAW_MARGIN) / tool.grasp.width,
         (kit.height - kit.minimum_wall) / tool.height,

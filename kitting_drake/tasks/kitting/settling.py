@@ -29,8 +29,8 @@ from pydrake.systems.framework import DiagramBuilder
 from kitting_drake.common.sdformat import model_text
 from kitting_drake.hkd.tools.sdf import FRICTION, HUNT_CROSSLEY_DISSIPATION, HYDROELASTIC_MODULUS
 
-# The contact of episodes, so that what has settled stays at rest when the episode begins. With
-# contact at points nothing comes to rest, and longer steps are no faster.
+# Use the contact model of episodes, so that bodies that have settled stay at rest when the episode
+# begins. With point contact nothing comes to rest, and longer steps are not faster.
 _CONTACT = MultibodyPlantConfig(
     time_step=1 / 128, contact_model="hydroelastic", discrete_contact_approximation="lagged"
 )
@@ -44,22 +44,22 @@ _BLOCK_FRICTION = CoulombFriction(0.3, 0.3)
 _CHECKS = 1 / 16
 """Time between two checks for rest, in s; a multiple of both time steps."""
 _STILL = 4
-"""Bodies are at rest if they pass so many checks in a row, as in `RestDetector`. Velocities do not
-tell: a flat body on a plane may chatter without moving."""
+"""Bodies are at rest if they pass this many checks in a row, as in `RestDetector`. Velocities are
+not checked, because a flat body on a plane may chatter without changing its place."""
 _POSITION, _ANGLE = 0.0003, 0.01
-"""A body that stays within these of one pose is at rest, in m and rad."""
+"""A body passes a check if its pose has changed by less than this, in m and rad."""
 
 
 @dataclass(frozen=True)
 class ConvexBody:
-    """A free body of convex pieces, in its frame B, in SI units."""
+    """A free body that consists of convex pieces, in its frame B and in SI units."""
 
     pieces: tuple[NDArray[np.float64], ...]
-    """(n, 3) points of each piece; it is their convex hull."""
+    """For each piece, points (n, 3) whose convex hull it is."""
     mass: float
     center_of_mass: NDArray[np.float64]
     inertia: NDArray[np.float64]
-    """(3, 3) about the centre of mass."""
+    """(3, 3) rotational inertia about the centre of mass, in kg m^2."""
 
 
 @dataclass(frozen=True)
@@ -67,15 +67,15 @@ class StillBlock:
     """A box that never moves."""
 
     size: tuple[float, float, float]
-    """In metres."""
+    """Side lengths of the box, in metres."""
     X_WB: RigidTransform
-    """Pose of the middle of its bottom."""
+    """Pose in the world of the middle of the box's bottom."""
 
 
 SettlingModel = Path | ConvexBody
-"""An SDFormat file of one free link, or a body of convex pieces."""
+"""A body that can settle: an SDFormat file of one free link, or a body of convex pieces."""
 Still = StillBlock | tuple[Path, RigidTransform]
-"""A box, or an SDFormat file of one link with its pose."""
+"""A body that never moves: a box, or an SDFormat file of one link with its pose in the world."""
 
 
 def settle(
@@ -86,14 +86,15 @@ def settle(
     longest: float = 3.0,
     goes_on: Callable[[Sequence[RigidTransform]], bool] = lambda poses: True,
 ) -> list[RigidTransform] | None:
-    """Simulates bodies from rest until they are at rest again; deterministic.
+    """Simulates bodies from given poses until they are at rest. The result is deterministic.
 
     Args:
-        models: n bodies.
-        poses: n, X_WB at the start.
-        still: what else stands on the table.
-        longest: time limit, in s of simulated time.
-        goes_on: is given the poses from time to time and returns whether to continue.
+        models: the n bodies.
+        poses: X_WB of each of the n bodies at the start, where they are at rest.
+        still: bodies on the table that do not move.
+        longest: limit of the simulated time, in s.
+        goes_on: a function that gets the poses at regular intervals and returns whether to
+            continue.
 
     Returns:
         X_WB of each body; None if they did not come to rest, if the contact solver did not

@@ -1,4 +1,4 @@
-"""Checks whether tools lie, and can be gripped, as the start of an episode needs."""
+"""Checks whether tools that have settled are a valid start of an episode."""
 
 import math
 from collections.abc import Sequence
@@ -21,22 +21,25 @@ from systems.oracle_policy import gripper_pose
 from systems.signals import PixelGrid
 
 FACES = ("as_drawn", "any")
-"""On which faces tools may lie."""
+"""The allowed values of a task's `faces`: the faces on which tools may lie."""
 TRAY = MODELS / "tray" / "tray.sdf"
 """The model of the tray."""
 TRAY_SIZE = (0.380, 0.290, 0.020)
-"""Outer extents along x, y and z of the tray's frame, whose origin is the middle of its bottom."""
+"""Outer extents of the tray along x, y and z of its frame, in metres. The origin of the frame is
+the middle of the tray's bottom."""
 
 _POINTS = 1500
-"""Points of a tool's surface that tell whether it is in the way."""
+"""Number of points of a tool's surface that are used to check whether it is in the way of the
+hand."""
 _UPRIGHT = math.cos(math.radians(60.0))
-"""A tool tilted further lies on another face than the one that was drawn."""
+"""Cosine of a tilt. A tool tilted by more lies on another face than at first."""
 _ON_KIT = 0.002
-"""A point this far inside the block's outline is on the kit, in metres."""
+"""A point at least this far inside the block's outline counts as on the kit, in metres."""
 _NEAR_GRASP = 0.035
-"""Touching tools have a free grasp this near the annotated one, when others are taken, in m."""
+"""Each of several touching tools, once the ones before it are taken away, must have a free grasp at
+most this far from its annotated one, in m."""
 _LEANS = math.radians(5.0)
-"""A tool tilted further leans."""
+"""A tool tilted by more than this counts as leaning, in radians."""
 
 
 @dataclass(frozen=True)
@@ -46,17 +49,17 @@ class Start:
     X_WKit: RigidTransform
     X_WTools: tuple[RigidTransform, ...]
     X_WTray: RigidTransform | None
-    """None without a tray."""
+    """Pose of the tray; None if there is no tray."""
 
 
 def surface_of_box(size: Sequence[float]) -> NDArray[np.float64]:
-    """(m, 3) points of a box that stands on the origin, in metres."""
+    """(m, 3) points of the surface of a box whose bottom's middle is the origin, in metres."""
     length, width, height = size
     return box_points((length, width, height))
 
 
 class StartCheck:
-    """Whether settled tools lie as they should."""
+    """Checks the poses of tools before, during and after they settle."""
 
     def __init__(
         self,
@@ -83,7 +86,8 @@ class StartCheck:
         }
 
     def may_settle(self, X_WTools: Sequence[RigidTransform]) -> bool:
-        """Whether drawn poses are worth a simulation. Touching tools hardly move."""
+        """Whether drawn poses may become a valid start. Only touching tools, which hardly move, are
+        checked before the simulation."""
         return self._kind != "touching" or self._is_graspable(X_WTools)
 
     def may_go_on(self, X_WTools: Sequence[RigidTransform]) -> bool:
@@ -96,7 +100,7 @@ class StartCheck:
         return True
 
     def is_good(self, X_WTools: Sequence[RigidTransform]) -> bool:
-        """Whether the tools at rest make a start of this kind."""
+        """Whether the tools at rest are a valid start of the wanted kind."""
         (x_low, y_low), (x_high, y_high) = TABLE
         X_KW = self._drawn.X_WKit.inverse()
         for index, (points, X) in enumerate(zip(self._points, X_WTools, strict=True)):

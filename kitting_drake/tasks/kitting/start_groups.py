@@ -1,4 +1,5 @@
-"""Groups of tools that touch, cross, lean on the kit or fall into a heap, before they settle."""
+"""Draws groups of tools that touch, cross, lean on the kit or fall into a heap. They settle
+later."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -18,15 +19,15 @@ KIT = -1
 _GAP = 0.003
 """Largest gap between touching tools, in metres."""
 _ALONGSIDE = 0.10
-"""Touching tools are shifted along each other by up to this, in metres."""
+"""Largest shift of touching tools along each other, in metres."""
 _SPLAY = math.radians(6.0)
-"""Touching tools differ in direction by up to this."""
+"""Largest angle between the directions of touching tools, in radians."""
 _CROSSING = (math.radians(50.0), math.radians(130.0))
-"""Range of the angle between crossed tools."""
+"""Range of the angle between crossed tools, in radians."""
 _CROSSING_SHARE = 0.2
-"""Tools cross within this share of their length from their middles."""
+"""Largest distance of the crossing from the middle of each tool, as a share of its length."""
 _LIFT = 0.002
-"""Tools fall from this height onto what lies below, in metres."""
+"""Height from which a tool falls onto the one below it, in metres."""
 
 _HEAP_RADIUS = 0.05
 """Tools of a heap fall from above a disc of this radius, in metres."""
@@ -35,24 +36,24 @@ _HEAP_REACH = 0.12
 _HEAP_HEIGHT, _HEAP_STEP = 0.12, 0.03
 """The lowest tool of a heap falls from this height, each other from a step higher, in metres."""
 _HEAP_TILT = math.radians(15.0)
-"""Tools of a heap begin with a roll and a pitch of up to this."""
+"""Largest roll and pitch of the tools of a heap before they fall, in radians."""
 
 _LEAN_OVER = (0.008, 0.022)
-"""How far a leaning tool reaches over the block's edge, in metres."""
+"""Range of the length by which a leaning tool extends over the block's edge, in metres."""
 _LEAN_SPLAY = math.radians(25.0)
-"""A leaning tool deviates from the normal of the block's side by up to this."""
+"""Largest angle between a leaning tool and the normal of the block's side, in radians."""
 _LEAN_CORNER = 0.04
-"""It keeps this distance from the block's corners, in metres."""
+"""Least distance of a leaning tool from the block's corners, in metres."""
 
 
 @dataclass(frozen=True)
 class Group:
-    """Things that are placed on the table together."""
+    """Tools, and perhaps the kit, that are placed on the table together."""
 
     members: dict[int, RigidTransform]
-    """Poses relative to the group's frame by the tool's index, or `KIT`."""
+    """Pose of each member in the group's frame, by the tool's index or `KIT`."""
     outline: CrossSection
-    """The area that it covers on the table, in the group's frame, in metres."""
+    """The area that the group covers on the table, in the group's frame, in metres."""
 
 
 def start_groups(
@@ -62,7 +63,7 @@ def start_groups(
 
     Args:
         kit: the kit.
-        tools: the tools; each is a member of one group.
+        tools: the tools; each belongs to one group.
         kind: one of `START_KINDS`.
         rng: the generator of all random draws.
     """
@@ -90,7 +91,7 @@ def _apart(block: Group, kit: Kit, tools: Sequence[Tool], rng: np.random.Generat
 def _paired(
     pair: Callable[[Tool, Tool, np.random.Generator], RigidTransform],
 ) -> Callable[..., list[Group]]:
-    """Groups of two tools; `pair` draws the pose of the second one relative to the first."""
+    """Makes groups of two tools. `pair` draws the pose of the second tool relative to the first."""
 
     def draw(
         block: Group, kit: Kit, tools: Sequence[Tool], rng: np.random.Generator
@@ -110,7 +111,7 @@ def _paired(
 
 
 def _beside(tool: Tool, other: Tool, rng: np.random.Generator) -> RigidTransform:
-    """Side by side, with a small gap."""
+    """Draws the pose of a tool beside another one, with a small gap."""
     yaw = float(rng.uniform(-_SPLAY, _SPLAY)) + math.pi * int(rng.integers(2))
     along, gap = float(rng.uniform(-_ALONGSIDE, _ALONGSIDE)), float(rng.uniform(0.0, _GAP))
     grown = tool.footprint.offset(gap, JoinType.Round, circular_segments=32)
@@ -124,7 +125,7 @@ def _beside(tool: Tool, other: Tool, rng: np.random.Generator) -> RigidTransform
 
 
 def _across(tool: Tool, other: Tool, rng: np.random.Generator) -> RigidTransform:
-    """One across another."""
+    """Draws the pose of a tool that lies across another one."""
     yaw = float(rng.uniform(*_CROSSING)) + math.pi * int(rng.integers(2))
     share, other_share = rng.uniform(-_CROSSING_SHARE, _CROSSING_SHARE, 2).tolist()
     x = share * tool.length - other_share * other.length * math.cos(yaw)
@@ -133,7 +134,7 @@ def _across(tool: Tool, other: Tool, rng: np.random.Generator) -> RigidTransform
 
 
 def _heap(block: Group, kit: Kit, tools: Sequence[Tool], rng: np.random.Generator) -> list[Group]:
-    """All tools above a disc, one above another."""
+    """Puts all tools above a disc, one above another, so that they fall into a heap."""
     members = {}
     for step, index in enumerate(rng.permutation(len(tools)).tolist()):
         radius = _HEAP_RADIUS * math.sqrt(float(rng.random()))
@@ -153,7 +154,7 @@ def _heap(block: Group, kit: Kit, tools: Sequence[Tool], rng: np.random.Generato
 def _leaning(
     block: Group, kit: Kit, tools: Sequence[Tool], rng: np.random.Generator
 ) -> list[Group]:
-    """Half of the tools lean on the block's sides, each on its own; the others lie apart."""
+    """Lets half of the tools lean on different sides of the block. The others lie apart."""
     order = rng.permutation(len(tools)).tolist()
     leaning = order[: (len(order) + 1) // 2]
     sides = rng.permutation(4).tolist()
@@ -166,12 +167,14 @@ def _leaning(
 
 
 def _lean(kit: Kit, tool: Tool, side: int, rng: np.random.Generator) -> RigidTransform:
-    """X_KT of a tool with one end on the table and the other on the edge of a side of the block.
+    """X_KT, the pose of a tool in the kit's frame, with one end on the table and the other on an
+    upper edge of the block.
 
     Args:
         kit: the kit.
         tool: the tool.
-        side: the side's normal is x of K, turned by so many quarter turns.
+        side: number of the block's side. Its normal is the x axis of K, rotated by this many
+            quarter turns.
         rng: the generator of all random draws.
     """
     length, width, height = kit.size
@@ -180,10 +183,10 @@ def _lean(kit: Kit, tool: Tool, side: int, rng: np.random.Generator) -> RigidTra
     along = float(rng.uniform(-room, room))
     splay, over = float(rng.uniform(-_LEAN_SPLAY, _LEAN_SPLAY)), float(rng.uniform(*_LEAN_OVER))
     leads = bool(rng.integers(2))
-    # From the end on the table to the edge, along the tool.
+    # Distance along the tool from the end on the table to the block's edge.
     reach = tool.length - over
     pitch = math.asin(min(height / reach, 0.9))
-    # In the side's frame, x is its normal and the tool points to -x.
+    # In the frame of the side, x is the normal, and the tool points along -x.
     heading = math.pi + splay
     toward = np.array([math.cos(heading), math.sin(heading)])
     foot = np.array([half, along]) - reach * math.cos(pitch) * toward
@@ -201,6 +204,6 @@ GROUPS: dict[str, Callable[..., list[Group]]] = {
     "leaning": _leaning,
     "heap": _heap,
 }
-"""The draws of the groups, by kind."""
+"""The function that draws the groups, for each kind of start."""
 START_KINDS = tuple(GROUPS)
 """How the tools may lie at the start."""

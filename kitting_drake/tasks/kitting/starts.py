@@ -1,7 +1,7 @@
-"""Draws how the tools lie at the start: touching, crossed, leaning on the kit, or in a heap.
+"""Draws starts of episodes in which tools touch, cross, lean on the kit, or lie in a heap.
 
-Poses are drawn in groups (`start_groups`), the groups are placed on the table, and physics lets the
-tools come to rest (`settling`).
+Poses are drawn in groups (`start_groups`), the groups are placed on the table, and a simulation
+lets the tools come to rest (`settling`).
 """
 
 import math
@@ -32,22 +32,22 @@ from systems.grasp import Grasp
 from systems.signals import PixelGrid
 
 APART = "apart"
-"""The kind of start that is drawn without physics."""
+"""The kind of start in which tools lie apart. It needs no simulation."""
 
 _TRAY_WALL, _TRAY_FLOOR = 0.004, 0.003
 _REDRAWS = 40
-"""How often a start is drawn and settled again."""
+"""A start is drawn and settled at most this many times."""
 _TRIES, _RESTARTS = 200, 20
 
 
 @dataclass(frozen=True)
 class _Room:
-    """The area and the yaws that are allowed for the tools."""
+    """The area and the rotations that are allowed for the tools."""
 
     grid: PixelGrid
     spacing: float
     yaw_range: float
-    """In rad."""
+    """Rotations are between minus and plus this, in rad."""
 
     @property
     def outline(self) -> CrossSection:
@@ -73,25 +73,26 @@ def draw_start(
     rng: np.random.Generator,
     kit_model: bool = True,
 ) -> Start:
-    """Draws how the tools lie, and lets them come to rest.
+    """Draws poses of tools and kit, and lets the tools come to rest.
 
     A start is drawn again if a tool does not come to rest, leaves the workspace, the table or the
-    tray, lies on the kit block, or does not lie as its kind says.
+    tray, or lies on the kit block, or if the tools do not lie as `kind` requires.
 
     Args:
         kit: the kit.
         tools: the tools.
-        models: their models for the physics, in the same order.
-        grasps: the grasps of each, best first.
+        models: the tools' models for the simulation, in the same order.
+        grasps: the grasps of each tool, best first.
         kind: one of `START_KINDS`.
-        tray: whether the tools lie in a tray. It is `TRAY`.
-        faces: `as_drawn`, every tool rests on the face that lies down in its cavity; `any`, tools
-            may come to rest on another one.
-        grid: the workspace.
+        tray: whether the tools lie in the tray `TRAY`.
+        faces: with `as_drawn`, every tool rests on the face that is at the bottom in its cavity;
+            with `any`, tools may come to rest on another face.
+        grid: pixel grid of the workspace.
         spacing: least distance between groups of tools, and to the kit, in metres.
         yaw_range_deg: rotations are drawn within plus or minus this, in degrees.
         rng: the generator of all random draws.
-        kit_model: whether the kit's block is its model; else a box without cavities.
+        kit_model: whether the simulation uses the model of the kit's block. If not, it uses a box
+            without cavities.
 
     Raises:
         UserError: no such start was found.
@@ -115,9 +116,9 @@ def draw_start(
         if settled is not None and check.is_good(settled):
             return Start(drawn.X_WKit, tuple(settled), drawn.X_WTray)
     raise UserError(
-        f"task.start: no start '{kind}'{' in a tray' if tray else ''} of {len(tools)} tools was "
-        f"found in {_REDRAWS} draws: enlarge heightmap.rows and heightmap.cols, or name fewer or "
-        "shorter tools"
+        f"task.start: no valid start '{kind}'{' in a tray' if tray else ''} with {len(tools)} "
+        f"tools was found in {_REDRAWS} tries: enlarge heightmap.rows and heightmap.cols, or name "
+        "fewer or shorter tools"
     )
 
 
@@ -130,9 +131,10 @@ def draw_unsettled(
     spacing: float,
     rng: np.random.Generator,
 ) -> Start:
-    """Draws a start without physics. Tools side by side lie as they would come to rest.
+    """Draws a start without a simulation. Its poses are those at rest only if the tools lie side by
+    side.
 
-    The arguments are those of `draw_start`.
+    For the arguments see `draw_start`.
 
     Raises:
         UserError: there is no room.
@@ -144,7 +146,7 @@ def draw_unsettled(
 
 
 def check_start(start: str, tray: bool, faces: str, distractors: int) -> None:
-    """Raises ValueError for unknown words, and for combinations that do not exist."""
+    """Raises ValueError for unknown values and for invalid combinations."""
     for name, word, words in (("start", start, START_KINDS), ("faces", faces, FACES)):
         if word not in words:
             raise ValueError(f"task.{name} must be one of {', '.join(words)}, not '{word}'")
@@ -162,15 +164,15 @@ def cluttered_scene(
     grid: PixelGrid,
     max_actions: int,
 ) -> Scene:
-    """A scene whose expert chooses among many grasps and may lay tools aside.
+    """Makes a scene in which the expert chooses among many grasps and may lay tools aside.
 
     Args:
-        scene: of the kit and its tools, in the expert's order.
+        scene: the scene of the kit and its tools, in the order in which the expert takes them.
         kit: the kit.
         grasps: the grasps of the scene's objects, best first.
-        start: the poses.
-        grid: the workspace; tools are laid aside in it.
-        max_actions: the episode ends after this many.
+        start: the poses at the start.
+        grid: pixel grid of the workspace, in which tools are laid aside.
+        max_actions: number of actions after which the episode ends.
     """
     (fixture,) = scene.fixtures
     fixtures = [replace(fixture, p_FPoints=surface_of_box(kit.size))]
@@ -241,7 +243,8 @@ def _start(
 def _place(
     groups: Sequence[Group], area: CrossSection, room: _Room, rng: np.random.Generator
 ) -> list[RigidTransform] | None:
-    """X_W of each group: within the area, at a distance from each other. None: no room."""
+    """Draws a pose in the world for each group, within the area and at a distance from each other;
+    None if there is no room."""
     x_min, y_min, x_max, y_max = area.bounds()
 
     def draw(group: Group, placed: list[tuple[RigidTransform, CrossSection]]):

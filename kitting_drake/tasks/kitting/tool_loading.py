@@ -1,4 +1,4 @@
-"""Loads the tools that a kitting task names, and checks that they can be held."""
+"""Loads the tools that a kitting task names, and checks that the hand can hold them."""
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -9,7 +9,7 @@ from kitting_drake.hkd.kits.layout import MOST_TOOLS
 from kitting_drake.hkd.tools.tool import Tool
 from systems.hand_geometry import MAX_OPENING
 
-ANNOTATE = "save another grasp by `hkd annotate`"
+ANNOTATE = "save another grasp with `hkd annotate`"
 
 
 def check_grasps(tools: Sequence[Tool], advice: str) -> None:
@@ -24,15 +24,15 @@ def check_grasps(tools: Sequence[Tool], advice: str) -> None:
 
 
 def load_tools(names: Iterable[str], base: Path, field: str = "task.tools") -> list[Tool]:
-    """The tools or parts of these names, or in these folders; each is read once.
+    """Loads tools or simple parts by their names or folders. Each is read only once.
 
     Args:
-        names: repetitions are allowed.
-        base: the base of relative paths.
-        field: the names' field in the scenario, for errors.
+        names: names or folders; repetitions are allowed.
+        base: base folder of relative paths.
+        field: the scenario's field with the names, for error messages.
 
     Raises:
-        UserError: there is no such tool.
+        UserError: a tool does not exist.
     """
     names = list(names)
     loaded = {name: _load_tool(name, base, field) for name in dict.fromkeys(names)}

@@ -1,4 +1,4 @@
-"""Draws poses of kit and tools on the table, or checks given ones."""
+"""Draws poses of kit and tools on the table, and checks given poses."""
 
 import math
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ _RESTARTS = 60
 _DISTRACTOR_SPACING = 0.01
 """Least distance of a drawn box from anything else, in metres."""
 _MANY = 6
-"""If there are more tools than this, those hardest to place are drawn first."""
+"""If there are more tools than this, the tools that are hardest to place are drawn first."""
 
 
 @dataclass
@@ -37,19 +37,19 @@ class TablePose:
     yaw_deg: float = bounded(0.0, -360.0, 360.0)
 
     def transform(self) -> RigidTransform:
-        """X_W of a frame at this pose."""
+        """The pose as a transform X_W in the world."""
         yaw = np.deg2rad(self.yaw_deg)
         return RigidTransform(RollPitchYaw(0, 0, yaw), [self.x, self.y, 0])
 
 
 @dataclass(frozen=True)
 class _Footprint:
-    """The areas that a thing, and the open hand that grasps it, cover on the table."""
+    """The areas on the table that an object, and the open hand that grasps it, cover."""
 
     outline: CrossSection
     fingers: CrossSection
     palm: CrossSection
-    """The palm clears the tools, but not the kit block."""
+    """The area of the palm, which is above the tools but not above the kit block."""
 
     def moved(self, pose: TablePose) -> "_Footprint":
         return _Footprint(
@@ -64,7 +64,7 @@ _Drawn = tuple[TablePose, _Footprint]
 
 
 def outline_at(outline: CrossSection, X_W: RigidTransform) -> CrossSection:
-    """The outline of an upright thing at a pose on the table."""
+    """The outline, in the world, of an upright object at a pose on the table."""
     yaw = RollPitchYaw(X_W.rotation()).yaw_angle()
     return outline.rotate(math.degrees(yaw)).translate(tuple(X_W.translation()[:2]))
 
@@ -81,11 +81,11 @@ def check_arrangement(
 
     Args:
         kit: the kit.
-        kit_pose: its pose.
+        kit_pose: the kit's pose.
         tools: the tools and their poses, by the scenario's names.
 
     Raises:
-        UserError: they are off the table or overlap; the message names the fields.
+        UserError: something is off the table, or two things overlap. The message names the fields.
     """
     table = _rectangle(*TABLE)
     placed: dict[str, CrossSection] = {}
@@ -114,7 +114,7 @@ def draw_poses(
     yaw_range_deg: float,
     rng: np.random.Generator,
 ) -> tuple[RigidTransform, list[RigidTransform]]:
-    """Draws poses of one kit and its tools: `draw_kit_poses` with a single kit."""
+    """Draws poses of one kit and its tools. For the arguments see `draw_kit_poses`."""
     X_WKits, X_WTools = draw_kit_poses(
         [kit], tools, grid=grid, spacing=spacing, yaw_range_deg=yaw_range_deg, rng=rng
     )
@@ -138,12 +138,12 @@ def draw_kit_poses(
     Args:
         kits: the kits.
         tools: the tools.
-        grid: the workspace.
-        spacing: least distance between any two, in metres.
+        grid: pixel grid of the workspace.
+        spacing: least distance between any two kits or tools, in metres.
         yaw_range_deg: rotations are drawn within plus or minus this, in degrees.
         rng: the generator of all random draws.
-        margins: how far each kit reaches beyond its outline because it is tilted, in metres; by
-            default not at all.
+        margins: how far each kit extends beyond its outline because it is tilted, in metres; zero
+            by default.
 
     Returns:
         X_WKit of each kit, and X_WT of each tool.
@@ -181,7 +181,7 @@ def draw_kit_poses(
 
 
 def _grown_block(kit: Kit, margin: float) -> CrossSection:
-    """The outline of a kit block, with a margin for its tilt, in its frame, in metres."""
+    """The outline of a kit block with a margin for its tilt, in the kit's frame, in metres."""
     length, width, _ = kit.size
     return CrossSection.square((length + 2 * margin, width + 2 * margin), True)
 
@@ -196,7 +196,7 @@ def _draw_pose(
     yaw_range_deg: float,
     rng: np.random.Generator,
 ) -> _Drawn | None:
-    """Draws a free pose; None if none was found. The kit blocks are among what is placed."""
+    """Draws a free pose; None if none was found. `placed` must include the kit blocks."""
     for _ in range(_TRIES):
         x, y = rng.uniform((grid.x_min, grid.y_min), (grid.x_max, grid.y_max))
         pose = TablePose(x=x, y=y, yaw_deg=rng.uniform(-yaw_range_deg, yaw_range_deg))
@@ -220,10 +220,10 @@ class DrawnBox:
     """A random box on the table."""
 
     size: tuple[float, float, float]
-    """Along the box's axes, in metres."""
+    """Side lengths of the box, in metres."""
     colour: tuple[float, float, float]
     X_WB: RigidTransform
-    """Pose of the middle of the box's bottom."""
+    """Pose in the world of the middle of the box's bottom."""
 
 
 def draw_boxes(
@@ -237,11 +237,11 @@ def draw_boxes(
 ) -> list[DrawnBox]:
     """Draws boxes without a cavity, of random size and colour.
 
-    They keep clear of the kit, the tools, and the hand at each grasp. There are fewer than `count`
-    if there is no room.
+    The boxes keep clear of the kit, the tools, and the hand at each grasp. If there is not enough
+    room, there are fewer than `count`.
 
     Args:
-        count: largest number.
+        count: largest number of boxes.
         kits: the kits and their poses.
         tools: the tools.
         X_WTools: the poses of the tools in the world.
@@ -282,12 +282,12 @@ def _tool_footprint(tool: Tool) -> _Footprint:
     fingers, palm = (
         rectangle_at(size, grasp.x, grasp.y, grasp.theta) for size in (OPEN_FINGERS, PALM_SIZE)
     )
-    # The hull contains the outline and has fewer vertices.
+    # Use the convex hull, which contains the outline and has fewer vertices.
     return _Footprint(tool.footprint.hull(), fingers, palm)
 
 
 def rectangle_at(size: tuple[float, float], x: float, y: float, theta: float) -> CrossSection:
-    """A rectangle with its middle at (x, y), in metres, rotated by theta radians."""
+    """A rectangle with its middle at (x, y), rotated by theta; in metres and radians."""
     return CrossSection.square(size, True).rotate(math.degrees(theta)).translate((x, y))
 
 

@@ -24,19 +24,19 @@ from systems.placement import Goal
 from systems.signals import PixelGrid
 
 _ARM_LENGTH, _ARM_WIDTH = 0.055, 0.005
-"""The size of each arm of the marker, in metres."""
+"""Length and width of each arm of the marker, in metres."""
 _GRASP_OFFSET = 0.01
-"""The demonstrator grasps the box within this distance of its middle, in metres."""
+"""The demonstrator grasps the box at most this far from its middle, in metres."""
 
 
 @dataclass
 class AlignBoxCorner(PoseTask):
     """A box is put with one of its four corners into a marker."""
 
-    # Least and greatest length of the horizontal edges of the box, in m.
+    # Range of the lengths of the box's horizontal edges, in m.
     box_sides: list[float] = bounded([0.03, 0.07], 0.01, 0.07)
 
-    # Least and greatest height of the box, in m.
+    # Range of the box's height, in m.
     box_height: list[float] = bounded([0.03, 0.06], 0.015, 0.1)
 
     def make_scene(self, *, grid: PixelGrid, seed: int, base: Path) -> Scene:
@@ -77,7 +77,8 @@ def corner_poses(size: tuple[float, float, float]) -> list[RigidTransform]:
 
 
 def _marker_footprint(size: tuple[float, float, float]) -> Footprint:
-    """The marker, all boxes that may be put there, and the hand that puts them."""
+    """The footprint of the marker, of all poses of the box at the marker, and of the hand that
+    places it."""
     longest = max(size[:2])
     side = max(_ARM_LENGTH - _ARM_WIDTH, longest)
     middle = (side - _ARM_WIDTH) / 2

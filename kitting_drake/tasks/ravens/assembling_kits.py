@@ -1,4 +1,4 @@
-"""assembling-kits: flat shapes are put into the cavities of a kit."""
+"""assembling-kits: put flat shapes into the cavities of a kit."""
 
 import dataclasses
 import math
@@ -42,7 +42,7 @@ _SPLITS = ("train", "test")
 _MOST_ACTIONS = 10
 _TRIES, _RESTARTS = 100, 50
 _MANISKILL = PoseWithin(0.02, math.radians(4.0), 0.003)
-"""Success in the task of the same name in ManiSkill."""
+"""The success predicate of ManiSkill's task of the same name."""
 _ADD_S = AddS()
 
 
@@ -54,17 +54,20 @@ def _kit() -> KitParameters:
 class AssemblingKits(PoseTask):
     """Five flat shapes are put into the cavities of a kit, which are hollow here.
 
-    Each episode draws the shapes, their places in the kit, and all poses. Success is Ravens'; the
-    results also tell ADD-S and the success of ManiSkill's task of this name.
+    Each episode draws the shapes, their places in the kit, and all poses. Success is measured as in
+    Ravens. The results also contain ADD-S, and the success by the measure of ManiSkill's task of
+    the same name.
     """
 
-    # The project's shapes: train (14) or test (6).
+    # Which of the project's shapes are used: train (14 shapes) or test (6 shapes).
     split: str = "train"
 
-    # Alternatively, a folder of meshes of flat shapes with z up, e.g. the ones of Ravens.
+    # A folder of meshes of flat shapes with z up, such as those of Ravens, that replace the
+    # project's shapes.
     shapes: str = ""
 
-    # Metres per unit of these meshes along x, y and z; the default is Ravens'.
+    # Scale of these meshes along x, y and z, in metres per unit of the mesh. The default suits the
+    # meshes of Ravens.
     scale: list[float] = bounded(list(RAVENS_SCALE), 1e-6, 1000.0)
 
     # The kit block and its cavities.
@@ -105,11 +108,11 @@ class AssemblingKits(PoseTask):
         return self._scored(scene, [tools[index] for index in order])
 
     def _scored(self, scene: Scene, tools: Sequence[Tool]) -> Scene:
-        """The scene with the task's measures, and with results grouped by shape.
+        """Adds the task's measures to a scene, and groups the results by shape.
 
         Args:
             scene: a scene of a kit.
-            tools: the tool of each object.
+            tools: for each object of the scene, its shape.
         """
         return dataclasses.replace(
             scene,
@@ -146,10 +149,10 @@ class AssemblingKits(PoseTask):
             raise type(error)(f"task.shapes: {error}") from error
 
     def _draw_places(self, tools: Sequence[Tool], rng: np.random.Generator) -> list[CavityPose]:
-        """Draws the headings of the cavities, with walls between them.
+        """Draws the headings of the cavities so that there are walls between them.
 
         Raises:
-            UserError: a shape is too large.
+            UserError: a shape is too large for its place.
         """
         height, wall = self.kit.height, self.kit.minimum_wall
         room = CrossSection.square((self.kit.length - wall, self.kit.width - wall), True)
@@ -206,7 +209,8 @@ class AssemblingKits(PoseTask):
 
 
 def _grown_rim(tool: Tool, parameters: KitParameters) -> CrossSection:
-    """The rim of a shape's cavity, grown by half the least wall, in the shape's frame."""
+    """The rim of a shape's cavity, enlarged by half of the least thickness of a wall, in the
+    shape's frame."""
     outline = cavity_outline(tool.footprint, parameters)
     rim = Cavity(outline, 0.0, parameters.height, parameters.lead_in).rim
     return rim.offset(parameters.minimum_wall / 2, JoinType.Round, circular_segments=ARC_SEGMENTS)

@@ -1,4 +1,4 @@
-"""block-insertion: an L-shaped block is put into a fixture with walls around it."""
+"""block-insertion: put an L-shaped block into a fixture with walls around it."""
 
 import math
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ _ARMS = (((0.08, 0.03, 0.04), (0.025, 0.0)), ((0.03, 0.05, 0.04), (0.0, 0.04)))
 _HEIGHT = 0.04
 _WALL_HEIGHT = 0.02
 _ALONG_ARM = (0.035, 0.055)
-"""Range of the demonstrator's grasps along an arm, from the corner, in metres."""
+"""Range of the distance of the demonstrator's grasps from the corner along an arm, in metres."""
 
 
 def _grasp(along_x: bool, distance: float) -> Grasp:
@@ -77,7 +77,7 @@ def _surface_points() -> np.ndarray:
     (long_size, long_middle), (short_size, short_middle) = _ARMS
     long_points = box_points(long_size) + (*long_middle, 0.0)
     short_points = box_points(short_size) + (*short_middle, 0.0)
-    # The face where the boxes meet is inside the block.
+    # Leave out the points at which the two boxes meet, because they are inside the block.
     seam = long_size[1] / 2
     on_seam = np.isclose(long_points[:, 1], seam) & (np.abs(long_points[:, 0]) < short_size[0] / 2)
     return np.concatenate(

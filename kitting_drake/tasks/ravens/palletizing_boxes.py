@@ -1,4 +1,4 @@
-"""palletizing-boxes: boxes that come one at a time are stacked on a pallet."""
+"""palletizing-boxes: stack boxes that appear one at a time on a pallet."""
 
 import math
 from collections.abc import Sequence
@@ -29,25 +29,26 @@ _BOX = (0.085, 0.04, 0.04)
 _X_WPALLET = RigidTransform([0.5, 0.25, 0.0])
 _PALLET_HEIGHT = 0.04
 _P_WSOURCE = (0.5, -0.25)
-"""(x, y) at which the boxes appear."""
+"""(x, y) in the world at which the boxes appear, in metres."""
 _DROP = 0.08
 """Height of a box's bottom when it appears, in metres; the first box lies on the table."""
 _SOURCE_AREA = ((-5.0, -0.5), (5.0, 0.0))
-"""The next box appears if no box is in this area: lower and upper (x, y), in metres."""
+"""The next box appears when no box is in this area, given by its lower and upper (x, y) corners, in
+metres."""
 _GRASP_OFFSET = 0.025
-"""The demonstrator grasps a box within this distance of its middle along its longer side, in
+"""The demonstrator grasps a box at most this far from its middle along its longer side, in
 metres."""
 _ZONE = (0.30, 0.25, 0.30)
-"""Size of the zone that counts, on and including the pallet, in metres."""
+"""Size of the zone in which boxes count, in metres. It includes the pallet."""
 
 _END_GAP = 0.01
 """Gap between the ends of two boxes in a line, in metres."""
 _TARGET_PITCH = 0.076
-"""Pitch of the three lines on the pallet, in metres: leaves room for a finger of 26.3 mm between
-two boxes."""
+"""Distance between the middles of the three lines of boxes on the pallet, in metres. It leaves room
+for a finger of 26.3 mm between two boxes."""
 
 _POINT_SPACING = 0.02
-"""Spacing of the points that measure a box's share in the zone, in metres."""
+"""Spacing of the points that are used to measure the share of a box inside the zone, in metres."""
 
 
 @dataclass
@@ -59,7 +60,7 @@ class PalletizingBoxes(RavensTask):
 
     causes = (NEVER_APPEARED, *RavensTask.causes)
 
-    # Layers of six boxes.
+    # Number of layers of six boxes.
     layers: int = bounded(3, 1, 4)
 
     def make_scene(self, *, grid: PixelGrid, seed: int, base: Path) -> Scene:
@@ -86,7 +87,8 @@ class PalletizingBoxes(RavensTask):
             )
         )
         X_WDeck = _X_WPALLET @ RigidTransform([0, 0, _PALLET_HEIGHT])
-        # Each layer is rotated by 90 degrees, to tie the columns together.
+        # Rotate each layer by 90 degrees relative to the one below, so that the columns hold
+        # together.
         X_WGoals = [
             X_WDeck @ layer[place]
             for level in range(self.layers)
@@ -97,7 +99,7 @@ class PalletizingBoxes(RavensTask):
         return Scene(
             objects=boxes,
             fixtures=(Fixture("pallet", MODELS / "ravens" / "pallet.sdf", _X_WPALLET),),
-            # Any order counts, as in Ravens.
+            # The boxes may be placed in any order, as in Ravens.
             goals=tuple(
                 Goal(
                     name=f"place {number} on the pallet",
@@ -120,7 +122,8 @@ class PalletizingBoxes(RavensTask):
         placement: Placement,
         records: Sequence[ActionRecord],
     ) -> str:
-        # An object far from the cell may also have fallen off the table after it appeared.
+        # Compare with the waiting pose, because an object far from the cell may also have fallen
+        # off the table after it appeared.
         waits = X_WB[index].IsNearlyEqualTo(scene.objects[index].X_WB, 1.0)
         if waits and np.linalg.norm(X_WB[index].translation()) > GONE:
             return NEVER_APPEARED

@@ -26,24 +26,24 @@ from systems.signals import PixelGrid
 _BOWL = Footprint((disc(0.06),))
 _DISTRACTOR_CUBE = Footprint(CUBE_FOOTPRINT.body)
 _BOWL_FLOOR = 0.004
-"""Height of a bowl's floor, in metres."""
+"""Height of a bowl's floor above the table, in metres."""
 
 
 @dataclass
 class PlaceRedInGreen(RavensTask):
     """Red cubes are put into green bowls.
 
-    The demonstrator grasps a cube on one of its centre lines. It gives the cube the heading of the
-    bowl, which is not visible.
+    The demonstrator grasps a cube on one of its centre lines. It rotates the cube to the heading of
+    the bowl, although this heading is not visible.
     """
 
-    # Colours define the goals, and distractors already have them.
+    # The colours define the goals, and the task has its own distractors.
     not_perturbed = ("colour", "distractors")
 
     # Largest number of green bowls. The number of red cubes is at most that of bowls.
     bowls: int = bounded(3, 1, 6)
 
-    # Cubes and bowls of other colours.
+    # Number of cubes and bowls of other colours.
     distractors: int = bounded(10, 0, 12)
 
     # A cube is in a bowl if its horizontal distance from the bowl's middle is at most this, in m.
@@ -57,7 +57,7 @@ class PlaceRedInGreen(RavensTask):
         rng = np.random.default_rng([seed, 1])
         bowl_count = int(rng.integers(1, self.bowls + 1))
         cube_count = int(rng.integers(1, bowl_count + 1))
-        # Both kinds are equally likely; each kind cycles through its colours.
+        # Cubes and bowls are equally likely, and each kind cycles through its colours.
         are_cubes = rng.random(self.distractors) < 0.5
         bowl_colours = ["green"] * bowl_count + _others("green", int((~are_cubes).sum()), rng)
         cube_colours = ["red"] * cube_count + _others("red", int(are_cubes.sum()), rng)
@@ -108,7 +108,7 @@ def _cubes(
 
 
 def _others(excluded: str, count: int, rng: np.random.Generator) -> list[str]:
-    """Colour names without `excluded`, in random order. They repeat once all have been used."""
+    """Names of colours except `excluded`, in random order. They repeat once all have been used."""
     names = [name for name in COLOURS if name != excluded]
     rng.shuffle(names)
     return [names[index % len(names)] for index in range(count)]

@@ -1,4 +1,4 @@
-"""The base of the Ravens tasks."""
+"""The base classes of the Ravens tasks."""
 
 import math
 import re
@@ -17,21 +17,23 @@ TOPPLED = "toppled"
 PREREQUISITE_MISSING = "prerequisite missing"
 
 _GRASP_STREAM = 2
-"""Random stream of the demonstrator's grasps; other draws do not depend on it."""
+"""Number of the random stream of the demonstrator's grasps, so that other draws do not depend on
+them."""
 
 _UPRIGHT = math.cos(math.radians(20.0))
-"""The cosine of the tilt above which an object has toppled."""
+"""Cosine of a tilt. An object that is tilted by more has toppled."""
 
 
 def grasp_rng(seed: int) -> np.random.Generator:
-    """The random generator of the demonstrator's grasps. As in the gripper version of Ravens, they
-    are off an object's middle, so that the pick reveals along which axis the jaws close."""
+    """The random generator of the demonstrator's grasps. As in the gripper version of Ravens,
+    grasps are not at an object's middle, so that the pick reveals along which axis the jaws
+    close."""
     return np.random.default_rng([seed, _GRASP_STREAM])
 
 
 @dataclass
 class RavensTask(TaskConfig):
-    """A task of Ravens: its title and the causes of failure."""
+    """Base class of the Ravens tasks, with the title and the causes of failure."""
 
     causes = (*TaskConfig.causes[:-1], TOPPLED, PREREQUISITE_MISSING, TaskConfig.causes[-1])
 
@@ -59,7 +61,7 @@ class RavensTask(TaskConfig):
         if X_WB[index].rotation().matrix()[2, 2] < _UPRIGHT:
             return TOPPLED
         if scene.success.share(placement, X_WB[index]) > 1 - 1e-9:
-            # It is in place, but its prerequisites are not.
+            # The object is in place, but its prerequisites are not filled.
             return PREREQUISITE_MISSING
         return cause
 
@@ -68,8 +70,9 @@ class RavensTask(TaskConfig):
 class PoseTask(RavensTask):
     """A task whose objects must come to rest in given poses."""
 
-    # An object is in place if its horizontal distance from its goal is below this, in m, and if the
-    # difference of headings, modulo the object's symmetry, is below the second, in degrees.
+    # An object is in place if its horizontal distance from its goal is below the first threshold,
+    # in m, and the difference of headings, modulo the object's symmetry, is below the second, in
+    # degrees.
     position_threshold: float = bounded(0.01, 1e-4, 0.5)
     angle_threshold_deg: float = bounded(15.0, 0.1, 180.0)
 

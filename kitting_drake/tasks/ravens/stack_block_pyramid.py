@@ -26,7 +26,7 @@ from systems.signals import PixelGrid
 _ROWS = (("purple", "blue", "green"), ("yellow", "orange"), ("red",))
 """The colours of the rows, from the bottom up."""
 _PITCH = 0.05
-"""Distance of neighbouring cubes in a row, along y of the base, in metres."""
+"""Distance between the middles of neighbouring cubes in a row, along y of the base, in metres."""
 _BASE_SIZE = (0.05, 0.15, 0.005)
 
 _BASE = Footprint(
@@ -77,7 +77,7 @@ class StackBlockPyramid(PoseTask):
 def _goals(X_WBase: RigidTransform) -> tuple[Goal, ...]:
     """A goal for each place of the pyramid, row by row.
 
-    Any cube of a row may fill any place of it. A row counts once the row below is complete.
+    Any cube of a row may fill any place of this row. A row counts once the row below is complete.
     """
     goals: list[Goal] = []
     below: tuple[int, ...] = ()
