@@ -259,7 +259,7 @@ def inverse_of_flange(
         at_wrist = np.arccos((distance**2 + _FORE**2 - _UPPER**2) / (2 * distance * _FORE))
         # The line to the shoulder makes this angle with -z5, the axis of the forearm.
         between = math.atan2(_A4, _D5) + _ELBOW * at_wrist
-        # -z5 lies in the plane of x6 and y6.
+        # Compute -z5, which lies in the plane of x6 and y6.
         along_x, along_y = np.sum(toward * x6, -1), np.sum(toward * y6, -1)
         spread = np.arccos(np.cos(between) / np.hypot(along_x, along_y)[..., None])
         angle = np.arctan2(along_y, along_x)[..., None] + _WRIST * spread
@@ -306,7 +306,7 @@ def _angles(
     q4 = np.arctan2(np.sum(x4 * z3, -1), np.sum(x4 * x3, -1))
     q5 = np.arctan2(-np.sum(x5 * z4, -1), np.sum(x5 * x4, -1))
     q6 = np.arctan2(np.sum(x6 * z5, -1), np.sum(x6 * x5, -1))
-    # The range of joint 6 extends beyond pi.
+    # The range of joint 6 extends beyond pi, so shift its angles.
     q6 = np.where(q6 < -np.pi / 2, q6 + math.tau, q6)
     return np.stack([q1, q2, q3, q4, q5, q6], -1)
 

@@ -24,7 +24,7 @@ class VelocityEnvelope:
 
         max(0, sqrt(2 d (q_max - q)) - offset),
 
-    and likewise towards q_min.
+    and the same limit holds for a motion towards q_min.
     """
 
     lower: _Seven

@@ -26,7 +26,7 @@ from systems.signals import PlanarPose
 from systems.vector_view import Array, Number
 
 _KEPT = 8
-"""How many planned motions are cached."""
+"""Number of planned motions that are cached."""
 _FARTHEST_STOP = 0.02
 """If a commanded stop is further than this from the hand's pose, in m, the arm brakes where it
 is."""
@@ -128,8 +128,6 @@ class ArmMotion(JawMotion):
         assert isinstance(state, ArmState)
         return self._way_of(state.way.tobytes())
 
-    # Before an action.
-
     def stops(self, state: PlannerState) -> list[HandStop]:
         """The places at which the hand goes down in the present action."""
         heights = MotionHeights(
@@ -181,8 +179,6 @@ class ArmMotion(JawMotion):
             if touched:
                 return f"on the way to the {name} the arm would collide with {touched}"
         return ""
-
-    # Modes.
 
     def wide(self, state: PlannerState) -> float:
         """The opening of the jaws before a grasp: the object's width plus some clearance, in m."""

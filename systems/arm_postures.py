@@ -211,7 +211,7 @@ class ArmPostures:
         return bool(self.within(line).all())
 
     def collision(self, way: NDArray[np.float64], surface: float, held: float = 0.0) -> str:
-        """What the arm collides with; see `arm_collisions.collision`."""
+        """Names what the arm collides with; see `arm_collisions.collision`."""
         return collision(way, self.base, surface, self._obstacles, held)
 
     def _ways(

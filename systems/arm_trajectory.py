@@ -111,7 +111,7 @@ class ArmTrajectory:
         return width, rate
 
     def force_at(self, time: float) -> float:
-        """The closing force, in N."""
+        """The closing force of the jaws at a time, in N."""
         force = 0.0
         for command in self.jaws:
             if command.time <= time:
@@ -189,7 +189,7 @@ def plan_action(
         return problem
     state.refused = not motion.prepare(state)
     assert not state.refused
-    # Check the limits at 1 kHz at least, whatever the rate of the points.
+    # Check the limits at 1 kHz or more, even if the rate of the points is lower.
     finer = math.ceil(FASTEST_RATE / rate)
     recorder = _Recorder(motion, state, parameters, rate, finer)
     recorder.record()

@@ -56,7 +56,7 @@ class WayVector(VectorView):
     speeds = Array(3)
     """Speeds of the line: above, between and below the marks."""
     yaw_speed = Number()
-    """Rate of the yaw on the line."""
+    """Largest rate of the yaw on the line."""
     over = Array(JOINTS)
     """Goal of a path that crosses: joint positions at the clear height, or at the goal if that is
     higher."""
@@ -167,8 +167,6 @@ class ArmWay:
         bounds = RowLimits(-high, high, acceleration)
         return plan_motion(points, self._limits, rows, bounds, self._inertia)
 
-    # Straight lines of the hand.
-
     def _line(
         self, q: NDArray[np.float64], goal: NDArray[np.float64], points: int = _LINE_POINTS
     ) -> NDArray[np.float64]:
@@ -202,8 +200,6 @@ class ArmWay:
         rows = np.column_stack([path.tips, yaw])
         acceleration = np.array([*[way.acceleration] * 3, _ANY_ACCELERATION])
         return self._timed(path.points, rows, high, acceleration)
-
-    # Paths that cross at a safe height.
 
     def _across(self, way: WayVector, q: NDArray[np.float64]) -> _Path:
         """A path that rises above the clear height, crosses straight in joint space, and sinks near

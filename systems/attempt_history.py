@@ -10,9 +10,9 @@ from systems.signals import OUTCOMES, Attempt, LeftOver, PickPlaceAction, Planar
 from systems.vector_view import Array, Number, VectorView
 
 MOST_ATTEMPTS = 64
-"""How many actions are remembered."""
+"""Number of actions that are remembered."""
 MOST_FAILED = 16
-"""How many failed picks are remembered."""
+"""Number of failed picks that are remembered."""
 _SAME_OBJECT = 0.040
 """If a measured centre of mass and a pick are closer than this, they are taken for the same
 object's, in metres."""

@@ -17,7 +17,7 @@ from systems.placement import PlacedObject, heading
 from systems.signals import PickPlaceAction, PlanarPose
 
 _PERIOD = 1 / 64
-"""The planner's period, in s."""
+"""The planner's update period, in s, with which its mode is read."""
 
 
 class AttemptMemory:

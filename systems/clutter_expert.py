@@ -60,7 +60,7 @@ class ClutterExpert:
 
         Args:
             index: index of the object.
-            X_WGoal: its goal pose.
+            X_WGoal: the object's goal pose in the world.
             rim: world z of the cavity's rim, in metres.
         """
         yaw = self._table.flat_heading(index, self._poses[index])

@@ -59,7 +59,7 @@ _SLENDER = 0.020
 _PALM_ROOM = PALM_HEIGHT - 0.003
 """Height of the palm above the fingertips, less a margin, in metres."""
 _MARGIN = 0.001
-"""Least clearance of the fingers, in metres."""
+"""Least clearance between a finger and other objects, in metres."""
 _SAME_PLACE, _SAME_ANGLE = 0.006, math.radians(15.0)
 """A grasp closer than this to one that failed counts as the same, in metres and radians."""
 
@@ -237,7 +237,8 @@ class ClutteredTable:
         poses: Sequence[RigidTransform],
         points: Sequence[Points],
     ) -> PlanarPose | None:
-        """Where the gripper lets go of an object to lay it aside; None if there is no room.
+        """The gripper pose at which an object is released to lay it aside; None if there is no
+        room.
 
         The place is on a free part of the table. For an object that lies upside down or stands on
         its edge, it is over an edge of the ledge instead: the object is released with its centre of

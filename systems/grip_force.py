@@ -79,7 +79,7 @@ def felt_lever(moment: float, weight: float) -> float:
     weight are then reduced together.
 
     Args:
-        moment: about the axis of the pads while the hand rests, in N m.
+        moment: moment about the axis of the pads while the hand rests, in N m.
         weight: the result of `felt_weight`, in N.
     """
     return min(max(moment / max(weight, 1e-3), -_LONGEST_LEVER), _LONGEST_LEVER)
@@ -89,7 +89,7 @@ def turns_in_the_pads(moment: float, times: float) -> bool:
     """Whether an object turns between the pads, or is about to.
 
     Args:
-        moment: about the axis of the pads while the hand rests, in N m.
+        moment: moment about the axis of the pads while the hand rests, in N m.
         times: how often this object was set down because it turned. Each time, a larger moment is
             allowed, so that the attempts end.
     """

@@ -26,7 +26,7 @@ class MotionLimits:
     yaw_acceleration: float
 
     def of_parts(self) -> tuple[tuple[float, float], ...]:
-        """(speed, acceleration) of each of the `PARTS`."""
+        """(speed, acceleration) limits of each of the `PARTS`."""
         linear = (self.speed, self.acceleration)
         return (linear, linear, (self.yaw_speed, self.yaw_acceleration))
 

@@ -17,7 +17,7 @@ fractions of `reach`."""
 _LEAST_RIM = 0.004
 """Least height of a cavity's rim above the table, in metres. It exceeds the noise of o_t."""
 _BACK = (0.0, 0.0)
-"""The last offset returns to the start."""
+"""The last offset, which returns to the start of the search."""
 
 
 @dataclass

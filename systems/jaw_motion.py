@@ -8,7 +8,7 @@ from systems.planner_state import PlannerState
 
 
 class JawMotion:
-    """Jaw openings and closing forces of all modes, as functions of the state."""
+    """Computes jaw openings and closing forces in all modes from the planner's state."""
 
     settles = math.inf
     """See `RobotMotion`; infinite, because the parameter `tare_settle` sets this time."""
@@ -74,7 +74,7 @@ class JawMotion:
         )
 
     def force_at(self, state: PlannerState, time: float) -> float:
-        """The closing force, in N."""
+        """The closing force at a time, in N."""
         fraction = 1.0
         if self._parameters.force_ramp > 0:
             elapsed = time - state.force_start_time

@@ -13,7 +13,7 @@ class MotionHeights:
     """Heights of the fingertips in the world, in metres."""
 
     grasp: float
-    """Height at which the jaws close."""
+    """Height of the fingertips at which the jaws close."""
     clear: float
     """Lowest height at which empty jaws clear everything."""
     travel: float

@@ -42,7 +42,7 @@ class PickPlaceParameters:
     # The hand's home: x, y, height of the fingertips (m), yaw (rad). The hand starts there; after
     # each action it returns to this x and height and keeps its y and yaw. The home must be out of
     # the cameras' sight. The default suits the three default cameras. For an overhead camera
-    # choose, e.g., [-0.4, 0, 0.4, 0].
+    # choose for example [-0.4, 0, 0.4, 0].
     home: list[float] = bounded([0.5, 0.0, 0.4, 0.0], -2.0, 2.0)
 
     # Clearance of the fingertips or the held object above the highest surface of the heightmap o_t

@@ -200,8 +200,6 @@ class PickPlacePlanner(LeafSystem):
     def _state(self, context: Context) -> PlannerState:
         return self._motion.view(context.get_discrete_state(self._state_index).get_value())
 
-    # Outputs.
-
     def _calc_motion(self, context: Context, output: BasicVector) -> None:
         state = self._state(context)
         output.SetFromVector(self._motion.motion_at(state, context.get_time()))
@@ -253,8 +251,6 @@ class PickPlacePlanner(LeafSystem):
             action = dataclasses.replace(action, left_over=LeftOverVector(kept).read())
         output.set_value(action)
 
-    # The force guard.
-
     def _feel(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         moment = self._moment(context, discrete_state)
         state = moment.state
@@ -280,8 +276,6 @@ class PickPlacePlanner(LeafSystem):
             self._contact_force.Eval(context),
             float(self._wrist_moment.Eval(context)[0]) if feels else 0.0,
         )
-
-    # The state machine.
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         moment = self._moment(context, discrete_state)

@@ -206,7 +206,7 @@ class PickPlaceSteps:
             self._motion.begin(state, Mode.LIFT, moment.time)
 
     def _set_down(self, moment: Moment) -> None:
-        """Lowers the object where it was picked."""
+        """Begins to lower the object to where it was picked."""
         state = moment.state
         self._guard.tare(state, moment.contact, self._parameters.contact_threshold)
         # The object may touch the table at any height, so move slowly and let go at the first

@@ -118,7 +118,7 @@ class Placement:
     goal: int | None = None
     """Index of the goal; None if no goal is left for the object."""
     pose: int = 0
-    """Index of the nearest of the goal's poses."""
+    """Index, among the goal's poses, of the one nearest to the object."""
     add_s: float = math.inf
     """ADD-S, equation 9 of the paper, in metres."""
     position_error: float = math.inf
@@ -419,15 +419,17 @@ def _measure(
 def complete_stages(
     goals: Sequence[Goal], placements: Sequence[Placement], kept: Set[int] = frozenset()
 ) -> frozenset[int]:
-    """Indices of the goals that are prerequisites of the same goal and have been filled at the same
-    time.
+    """Finds the goals of all stages that have been complete. A stage is the set of goals that are
+    prerequisites of one other goal; it is complete when all of them are filled at the same time.
 
-    As in the Ravens benchmark, the reward of such a stage is kept even if its objects move later.
+    As in the Ravens benchmark, the reward of a complete stage is kept even if its objects move
+    later.
 
     Args:
         goals: the goals of the task.
         placements: the present placements, evaluated with `kept`.
-        kept: indices of the goals of stages that were complete before.
+        kept: indices of the goals of stages that were complete before; they are included in the
+            result.
     """
     filled = kept | {item.goal for item in placements if item.success}
     return frozenset(kept).union(*(goal.after for goal in goals if filled >= {*goal.after}))

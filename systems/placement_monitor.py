@@ -115,7 +115,7 @@ class PlacementMonitor(LeafSystem):
 
     @property
     def goals(self) -> tuple[Goal, ...]:
-        """The goals."""
+        """The goals, in the order of the elements of the port `kept_goals`."""
         return self._goals
 
     def placements(self, context: Context) -> list[Placement]:

@@ -139,7 +139,8 @@ class RestDetector(LeafSystem):
         self._wake_distance = wake_distance
         self._period = period
         self._poses = self.DeclareAbstractInputPort("body_poses", Value([RigidTransform()]))
-        # Infinity makes the first update set every anchor.
+        # Anchors are the poses near which objects must stay. Begin with infinity, so that the first
+        # update sets them all.
         self._anchors = self.DeclareDiscreteState(np.full(12 * self._count, np.inf))
         self._still_for = self.DeclareDiscreteState(self._count)
         self._at_rest = self.DeclareDiscreteState(self._count)

@@ -49,7 +49,7 @@ class SensorNoiseParameters:
     # Share of the pixels beside an edge that get a depth between its two sides.
     flying_share: float = bounded(0.0, 0.0, 1.0)
 
-    # Share of the pixels that are holes, i.e. without depth.
+    # Share of the pixels that are holes, which have no depth.
     hole_share: float = bounded(0.0, 0.0, 0.9)
 
     # Surfaces seen at more than this angle from their normal give no depth, in degrees.
@@ -323,7 +323,7 @@ def median_depth(frames: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
     """
     stack = np.stack(frames)
     stack[~(np.isfinite(stack) & (stack > 0))] = np.nan
-    stack.sort(axis=0)  # NaN comes last.
+    stack.sort(axis=0)  # NaN is sorted to the end.
     count = np.isfinite(stack).sum(axis=0, keepdims=True)
     middle = [np.maximum(count - 1, 0) // 2, np.minimum(count // 2, len(stack) - 1)]
     low, high = (np.take_along_axis(stack, index, axis=0)[0] for index in middle)

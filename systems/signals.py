@@ -48,7 +48,7 @@ class PixelGrid:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(rows, cols)."""
+        """Numbers of pixels, (rows, cols)."""
         return self.rows, self.cols
 
     @property
@@ -172,7 +172,7 @@ class PlanarPose:
     """Rotation about world +z, in radians."""
 
     def as_array(self) -> NDArray[np.float64]:
-        """(x, y, theta)."""
+        """The pose as an array (x, y, theta), in metres and radians."""
         return np.array([self.x, self.y, self.theta])
 
 
@@ -184,21 +184,21 @@ class SurfaceHeights:
     """
 
     pick_top: float = 0.0
-    """The object's top at the pick."""
+    """Height of the object's top at the pick."""
     support: float = 0.0
-    """The surface that the object stands on."""
+    """Height of the surface on which the object stands."""
     place_rim: float = 0.0
-    """The highest surface around the place, for example the rim of a cavity."""
+    """Height of the highest surface around the place, for example the rim of a cavity."""
     place_floor: float = 0.0
-    """The lowest surface at the place, on which the object will stand."""
+    """Height of the lowest surface at the place, on which the object will stand."""
     near_pick: float = 0.0
-    """The highest surface below the open jaws at the pick."""
+    """Height of the highest surface below the open jaws at the pick."""
     near_place: float = 0.0
-    """The highest surface below the held object at the place."""
+    """Height of the highest surface below the held object at the place."""
     highest: float = 0.0
-    """The highest surface in the workspace."""
+    """Height of the highest surface in the workspace."""
     table: float = 0.0
-    """The table; the hand never goes below it."""
+    """Height of the table. The hand never goes below it."""
     doubt: float = 0.0
     """The uncertainty of differences between these heights; zero if o_t has no noise or tilt."""
     width: float = math.inf
@@ -262,10 +262,10 @@ class LeftOver:
 
 
 OUTCOMES = ("placed", "missed", "dropped", "pressed", "stopped", "set down", "unreachable")
-"""How an action may end: the object was let go at its place, nothing was grasped, the object was
-lost on the way, it was pressed down, a contact force above the limit ended the action, the object
-was set down at the pick because it would have turned between the pads, or the robot did not move
-because it cannot reach the poses."""
+"""The outcomes of an action: the object was let go at its place, nothing was grasped, the object
+was lost on the way, it was pressed down, a contact force above the limit ended the action, the
+object was set down at the pick because it would have turned between the pads, or the robot did not
+move because it cannot reach the poses."""
 
 
 @dataclass(frozen=True)
@@ -275,7 +275,7 @@ class Attempt:
     action: PickPlaceAction
     """The action, without heights."""
     outcome: str
-    """A word of `OUTCOMES`."""
+    """The outcome of the action, a word of `OUTCOMES`."""
     peak_force: float = 0.0
     """The largest contact force on the hand, in N, without the weight of the held object."""
     balance: tuple[float, float] | None = None
@@ -284,5 +284,5 @@ class Attempt:
 
 
 def wrap_to_pi(angle: float) -> float:
-    """The same angle in [-pi, pi], in radians."""
+    """The equivalent angle in [-pi, pi], in radians."""
     return math.remainder(angle, math.tau)

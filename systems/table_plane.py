@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 _STEP = 2
-"""Only every second row and column is used."""
+"""Only every second row and every second column is used, to save time."""
 _LEAST = 200
 """Least number of these pixels that must lie on the table."""
 _LEAST_SHARE = 0.15

@@ -19,7 +19,7 @@ INTERRUPTED = 130
 
 
 def seed_type(text: str) -> int:
-    """Parses a seed."""
+    """Parses a seed, for `argparse`."""
     try:
         seed = int(text)
     except ValueError:
@@ -31,7 +31,7 @@ def seed_type(text: str) -> int:
 
 
 def count_type(text: str) -> int:
-    """Parses a count of at least 1."""
+    """Parses a whole number of at least 1, for `argparse`."""
     try:
         count = int(text)
     except ValueError:

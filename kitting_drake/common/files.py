@@ -36,7 +36,7 @@ def write_atomically(path: Path, content: str | bytes) -> None:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Writes indented JSON with `write_atomically`."""
+    """Writes a value to a file as indented JSON, atomically."""
     write_atomically(path, json.dumps(value, indent=2) + "\n")
 
 
@@ -73,7 +73,7 @@ def replace_folder(folder: Path, made: Path, aside: Path) -> None:
 
 
 def files_digest(paths: Iterable[Path]) -> str:
-    """A digest of the files' contents, in order."""
+    """A digest of the contents of files in the given order."""
     digest = hashlib.sha256()
     for path in paths:
         # Hash each file separately, so that the digest depends on where one file ends and the next

@@ -42,7 +42,7 @@ def import_own(reference: str, base: Path) -> Any:
         base: the folder of the scenario's file.
 
     Raises:
-        Exception: whatever the module raises.
+        Exception: any exception that the module raises when it is imported.
     """
     module, _, name = reference.partition(":")
     with modules_beside(base):
@@ -60,7 +60,7 @@ def own_digest(module: str, base: Path) -> str:
     Raises:
         ImportError: the module cannot be imported.
         LookupError: the module has no file.
-        OSError: its sources cannot be read.
+        OSError: the module's sources cannot be read.
     """
     with modules_beside(base):
         spec = importlib.util.find_spec(module)

@@ -71,7 +71,7 @@ class Subprocess:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
         theirs.close()
         self.calls = 0
-        """Number of calls so far."""
+        """Number of calls that this process has executed."""
 
     def call(
         self, function: Callable[..., _Result], *arguments: object
@@ -223,7 +223,7 @@ def side_by_side(
         function: a function that is called in a thread and delegates the work to `workers`.
         draw: returns the next item, in the caller's thread. If it returns None, it is called again
             after the next result, and the iteration ends when no call is running.
-        workers: determines the number of threads.
+        workers: the workers, whose capacity determines the number of threads.
     """
     with ThreadPoolExecutor(_MOST_AT_WORK) as pool:
         working: set[Future[_Result]] = set()

@@ -50,7 +50,7 @@ class ActionLog:
         self.records: list[ActionRecord] = []
 
     def observe(self, event: ModeChange) -> None:
-        """Updates the records for an event."""
+        """Updates the records when the planner's mode changes."""
         if not event.is_last:
             self._follow(event)
         if self.records:

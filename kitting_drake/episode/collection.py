@@ -108,7 +108,7 @@ class Collection:
         Args:
             count: the number of demonstrations wanted.
             demonstrate: makes a demonstration; it is called in threads.
-            workers: determine the number of parallel calls.
+            workers: the workers, whose capacity determines the number of parallel calls.
             console: where to show the progress bar.
 
         Raises:

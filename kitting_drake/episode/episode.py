@@ -55,7 +55,7 @@ class EpisodeResult:
     policy: str
     seed: int
     objects: list[ObjectResult]
-    """The objects that can fill a goal."""
+    """The results of the objects that can fill a goal."""
     success_rate: float
     """The task's reward, from 0 to 1 (in kitting, the share of kitted tools); 0 if the episode
     failed or timed out."""

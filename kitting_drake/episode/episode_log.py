@@ -28,7 +28,7 @@ Arrays = dict[str, NDArray[Any]]
 
 
 def add_log_flag(parser: argparse.ArgumentParser) -> None:
-    """Adds `--log`."""
+    """Adds the flag `--log` to a parser."""
     parser.add_argument(
         "--log",
         type=Path,

@@ -30,7 +30,7 @@ def chosen_cameras(recording: FrameSettings, cameras: dict[str, Any]) -> tuple[s
 
 
 class JointView:
-    """Reads frames off a station."""
+    """Reads a station's joints, joint targets and camera images."""
 
     def __init__(self, station: KittingStation, recording: FrameSettings) -> None:
         """
@@ -45,7 +45,7 @@ class JointView:
         self.cameras = chosen_cameras(recording, station.scenario.cameras)
         joints = joint_names(station.scenario.robot)
         self.names = (*joints, GRIPPER)
-        """The names of the entries of state and command."""
+        """The names of the entries of `state` and `command`."""
         self._joints = len(joints)
         self._stiffness = station.scenario.controller.finger_stiffness
 

@@ -49,7 +49,7 @@ _DEFINITIONS = {
 
 @dataclass(frozen=True)
 class Message:
-    """A message on a topic."""
+    """A ROS 2 message with its topic and time."""
 
     topic: str
     kind: str

@@ -27,7 +27,7 @@ _UNSEEN, _STRIPE = (0.80, 0.72, 0.86), (0.68, 0.57, 0.78)
 _OUTSIDE = (0.90, 0.90, 0.90)
 """Colour of pixels outside all cameras' views or outside the region of interest."""
 _STRIPES = 6
-"""Width of a pair of stripes, in pixels."""
+"""Width of a dark and a light stripe together, in pixels."""
 _MOST_LETTERS = 150
 """Largest number of characters in a line of the title."""
 

@@ -109,7 +109,7 @@ def prove_kit(folder: Path, episodes: int, progress: Progress) -> str:
     Args:
         folder: a folder that `hkd kit` wrote.
         episodes: number of simulated episodes.
-        progress: called before each episode and at the end.
+        progress: a function that is called before each episode and at the end.
 
     Returns:
         The verdict, in a sentence or two.

@@ -16,7 +16,7 @@ Episode = dict[str, Any]
 """A line of `episodes.jsonl`: the result of `EpisodeResult.as_dict`."""
 
 Entry = dict[str, Any]
-"""An object or an action of an episode."""
+"""An object or an action in the result of an episode."""
 
 FAILED = "failed episode"
 TIMED_OUT = "timed out"
@@ -38,7 +38,7 @@ _FAILED_GRASPS = ("missed", "dropped", "stopped")
 """The outcomes of an action whose grasp was missed or lost, or that the force guard stopped."""
 
 ERRORS = ("add_s_mm", "position_error_mm", "angle_error_deg", "height_error_mm")
-"""The errors of an object's final pose."""
+"""Keys of the errors of an object's final pose."""
 
 ACTION_ERRORS = (
     "pick_position_error_mm",
@@ -158,7 +158,7 @@ def needless_actions(episode: Episode) -> int:
     but they may do harm."""
     useful = {item["name"] for item in episode["objects"] if item["add_s_mm"] is not None}
     if not useful:
-        # A failed episode may lack its objects.
+        # The result of a failed episode may have no objects.
         return 0
     return sum(action["object"] not in useful for action in episode["actions_taken"])
 
@@ -193,7 +193,8 @@ def counted_objects(episodes: Sequence[Episode]) -> list[list[Entry]]:
 
 
 def _outcome(episode: Episode, objects: list[Entry]) -> dict[str, Any]:
-    """An element of `outcomes`, without objects whose names were lost."""
+    """The element of the summary's `outcomes` for one episode. Objects whose names are unknown,
+    because the episode's process died, are left out."""
     return {key: episode[key] for key in ("seed", "success_rate", "strict_success_rate")} | {
         "objects": {
             item["name"]: int(item["success"]) + int(item["strict_success"])
@@ -311,7 +312,7 @@ def _statistics(
 
 
 def find_ambiguities(item: Mapping[str, Any]) -> list[str]:
-    """Why a success is not strict: names in `AMBIGUITIES`."""
+    """The names, in `AMBIGUITIES`, of the reasons why a success is not strict."""
     if not item["success"] or item["strict_success"]:
         return []
     return [name for name, (key, limit) in AMBIGUITIES.items() if abs(item[key]) > limit]

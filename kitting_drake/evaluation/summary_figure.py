@@ -38,7 +38,7 @@ _ANGLES = (0.02, 180.0)
 
 @dataclass(frozen=True)
 class _Look:
-    """The style of a category."""
+    """The style in which a category is drawn."""
 
     colour: str
     line: str
@@ -47,7 +47,7 @@ class _Look:
 
 @dataclass(frozen=True)
 class _Panel:
-    """The distribution of one error."""
+    """A panel of the figure, which shows the distribution of one error."""
 
     title: str
     unit: str

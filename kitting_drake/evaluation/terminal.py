@@ -92,7 +92,8 @@ def print_episode(console: Console, result: EpisodeResult) -> None:
 
 
 def _ending(result: EpisodeResult) -> str:
-    """Why the episode ended, what is left over, and the largest contact force, in one line."""
+    """A line that says why the episode ended, what is left over, and how large the contact force
+    was."""
     verdict = " (wrong)" if result.stop_reason_right is False else ""
     left = result.left_over.text or "nothing"
     line = f"stopped: {result.stop_reason}{verdict}; left over: {left}"

@@ -126,13 +126,13 @@ class Draft:
 
     look: Look
     stages: tuple[Stage, ...]
-    """The stages applied so far."""
+    """The stages that have been applied so far."""
     logits: Tensor
     """(rows, cols): the logits of the pick, -inf where it is excluded."""
     pixel: tuple[int, int]
     """(row, col) of the largest logit. The networks' crops are centred on it."""
     angles: AnglePrediction
-    """The predicted pick angle at `pixel`."""
+    """The predicted distribution of the pick angle at `pixel`."""
     placing: PlacePrediction
     """The predicted placements of the object at `pixel`."""
     pick: Array

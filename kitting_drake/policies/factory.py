@@ -83,10 +83,10 @@ def load_learned_policy(
         insertion: whether objects are inserted into recesses.
         orientations: N, the number of orientations.
         orientations_field: the caller's name for `orientations`, used in error messages.
-        continuous: see `make_stages`.
-        fit_outlines: see `make_stages`.
-        recover: see `make_stages`.
-        may_stop: see `make_stages`.
+        continuous: whether to refine actions beyond the networks' pixels and bins.
+        fit_outlines: whether to refine actions by the geometry of o_t as well.
+        recover: whether to correct failed insertions.
+        may_stop: whether the policy may stop when there is nothing left to pick.
         watch: if given, a function that is called with each observation and decision.
 
     Raises:

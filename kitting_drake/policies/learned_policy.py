@@ -84,7 +84,8 @@ class LearnedPolicy:
     ) -> None:
         """
         Args:
-            networks: for inference. `StopRule` uses their `stop_threshold`.
+            networks: networks that are prepared for inference. The stage `StopRule` uses their
+                `stop_threshold`.
             orientations: N, the number of orientations.
             stages: the stages, in the order in which they are applied (see `make_stages`). Without
                 stages this is the paper's policy, whose actions are quantized to pixels and bins.
@@ -184,7 +185,8 @@ def _left_over(draft: Draft) -> LeftOver | None:
 
 
 def _told(draft: Draft) -> dict[str, Any]:
-    """How far the stages moved an action, and the geometric facts about it."""
+    """Fields of `Decision` that say how far the stages moved an action, and the geometric facts
+    about it."""
     if draft.stop or not draft.outlined:
         return {}
     millimetres = 1e3 * draft.look.resolution

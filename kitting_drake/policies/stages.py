@@ -229,7 +229,8 @@ class StopRule:
 class OutlineStop:
     """Stops when both the networks and the outlines show that nothing is left to do.
 
-    - An object that fits into a recess is picked, whatever the networks say.
+    - An object that fits into a recess is picked, even if the networks predict that nothing is
+      left.
     - A region that may contain such an object (`Inventory.worth_a_try`) is picked if the networks'
       log-odds of something to pick are above the threshold.
     - Any other object is picked only if the log-odds are far above the threshold. An object that

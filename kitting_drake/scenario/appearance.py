@@ -10,7 +10,7 @@ from systems.bounds import bounded
 
 @dc.dataclass
 class Fixed:
-    """A given colour."""
+    """A fixed colour for a surface."""
 
     # Red, green and blue, 0 to 1.
     rgb: list[float] = bounded([0.5, 0.5, 0.5], 0.0, 1.0)

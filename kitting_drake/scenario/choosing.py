@@ -112,7 +112,7 @@ def choose_scenario(arguments: argparse.Namespace) -> ChosenScenario:
     """Loads the scenario that the flags of `scenario_parser` select.
 
     Raises:
-        UserError: as `load_scenario`.
+        UserError: the file cannot be read, or a field is invalid.
     """
     return find_scenario(
         arguments.scenario,
@@ -125,10 +125,10 @@ def choose_scenario(arguments: argparse.Namespace) -> ChosenScenario:
 def find_scenario(
     path: Path, name: str | None = None, text: str | None = None, perturb: str | None = None
 ) -> ChosenScenario:
-    """Loads a scenario as the command line does. For the arguments and errors see `load_scenario`.
+    """Loads a scenario as the command line does. For the arguments see `load_scenario`.
 
     Raises:
-        UserError: as `load_scenario`.
+        UserError: the file cannot be read, or a field is invalid.
     """
     if not path.exists() and not path.is_absolute() and ".." not in path.parts:
         # In any working directory, `scenarios/x.yaml` also finds the scenarios of an installed

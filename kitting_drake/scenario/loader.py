@@ -204,8 +204,8 @@ def _check_meaning(scenario: Scenario) -> None:
         )
     if -_PLAINLY_BELOW < scenario.heightmap.z_min < 0:
         raise ValueError(
-            f"heightmap.z_min is {scenario.heightmap.z_min:g}, too little below the table to "
-            f"differ from a calibration error: use 0, or -{_PLAINLY_BELOW:g} or less"
+            f"heightmap.z_min is {scenario.heightmap.z_min:g}, so close below the table that it "
+            f"could be a calibration error: use 0, or -{_PLAINLY_BELOW:g} or less"
         )
     if scenario.heightmap.z_max <= scenario.heightmap.z_min:
         raise ValueError("heightmap.z_max must be above heightmap.z_min")

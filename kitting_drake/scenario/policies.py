@@ -56,7 +56,7 @@ class PolicySite:
     grid: PixelGrid
     """The pixel grid of the observations."""
     base: Path
-    """The folder of relative paths in the scenario."""
+    """The base folder of relative paths in the scenario."""
     observer: DecisionObserver | None = None
     may_stop: bool = True
     """Whether the policy may decide to stop. It may not if the episode ends as soon as every goal
@@ -164,7 +164,7 @@ class QuantizedOracle(PolicyConfig):
 
 @dataclass
 class Learned(PolicyConfig):
-    """Networks trained by `train`."""
+    """A policy with networks that the command `train` trained."""
 
     # The weights file that `train` wrote, relative to the scenario's folder. If empty, the policy
     # for arbitrary tools in models/policies/ is used.

@@ -103,7 +103,7 @@ class Sleep:
 class Scenario:
     """A scenario. Together with a seed it determines an episode."""
 
-    # The seed if the command line gives none.
+    # The seed that is used if the command line gives none.
     random_seed: int = bounded(0, 0, 2**32 - 1)
 
     # Longest simulated time of an episode, in s.
@@ -140,13 +140,13 @@ class Scenario:
     # appearance: {paints: {"fixtures/kit/*": !Fixed {rgb: [0.8, 0.1, 0.1]}}}
     appearance: Appearance = dc.field(default_factory=Appearance)
 
-    # The policy's observation.
+    # The pixel grid of the policy's observation, and the workspace.
     heightmap: Heightmap = dc.field(default_factory=Heightmap)
 
     # The robot: !FloatingHand, or !FrankaArm for a whole arm; see robots.py.
     robot: Robot = dc.field(default_factory=FloatingHand)
 
-    # The motion of the hand, and its control.
+    # Parameters of the hand's motion, and gains of its controller.
     planner: PickPlaceParameters = dc.field(default_factory=PickPlaceParameters)
     controller: Controller = dc.field(default_factory=Controller)
 

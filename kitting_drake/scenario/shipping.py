@@ -24,7 +24,7 @@ machine."""
 
 @dataclasses.dataclass(frozen=True)
 class Shipment:
-    """The result of `pack`."""
+    """A packed scenario: the result of `pack`."""
 
     chosen: ChosenScenario
     """The scenario, with paths relative to the packed folder."""
@@ -81,7 +81,7 @@ def pack(chosen: ChosenScenario, folder: Path) -> Shipment:
         "excludes": ["__pycache__"],
         "env_vars": environment,
     }
-    # Ray rejects an empty list.
+    # Set the key only if there are modules, because Ray rejects an empty list.
     if modules := _own_modules([*scenario.policy.modules(), *scenario.task.modules()]):
         runtime_env["py_modules"] = [str(path) for path in modules]
     return Shipment(moved, runtime_env)

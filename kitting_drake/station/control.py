@@ -64,11 +64,11 @@ def add_control(
 
     Args:
         builder: the builder of the station.
-        scenario: configures planner and controller.
+        scenario: the scenario, which configures planner and controller.
         scene: determines the number of actions, and whether objects are inserted into cavities.
         plant: the finalized plant, with the robot.
-        projector: provides o_t, from which the planner reads heights; None if each action carries
-            its heights.
+        projector: the system that computes o_t, from which the planner reads heights; None if each
+            action carries its heights.
         motion: computes the robot's motions.
         seed: the seed of the noise of an arm's wrist force.
         takes_joint_targets: whether the controller's inputs are exported instead of connected to

@@ -40,7 +40,7 @@ def add_cameras(
 
     Args:
         builder: the builder of the station.
-        scenario: configures cameras, appearance and sensor noise.
+        scenario: the scenario, which configures cameras, appearance and sensor noise.
         scene_graph: the scene graph that the cameras see.
         grid: the pixel grid of the observation.
         seed: the seed of lights and noise.

@@ -124,7 +124,7 @@ class KittingStation(Diagram):
     def __init__(
         self, scenario: Scenario, *, seed: int, base: Path, takes_joint_targets: bool = False
     ) -> None:
-        """See `build_station`."""
+        """For the arguments see `build_station`."""
         super().__init__()
         self.scenario, self.seed, self.base = scenario, seed, base
         self.grid = scenario.heightmap.grid()
@@ -253,7 +253,7 @@ class KittingStation(Diagram):
         return bool(self._eval(root_context, "asks")[0])
 
     def observation(self, root_context: Context) -> Observation:
-        """The port `observation`: o_t, rendered now."""
+        """The port `observation`: the present observation o_t, which is rendered if necessary."""
         return self._eval(root_context, "observation")
 
     def counts(self, root_context: Context) -> tuple[int, int, int, int]:

@@ -82,7 +82,7 @@ class Footprint:
 
     @cached_property
     def palm(self) -> tuple[Polygon, ...]:
-        """The areas of the palm, one for each grasp."""
+        """The areas that the palm covers, one for each grasp."""
         return self._at_grasps(PALM_SIZE)
 
     def moved(self, x: float, y: float, yaw: float) -> Placed:

@@ -108,7 +108,7 @@ def read_demonstrations(path: Path, first: int | None = None) -> Demonstrations:
 
     Args:
         path: path of the file.
-        first: how many to read, in the order of their seeds; None for all.
+        first: number of demonstrations to read, in the order of their seeds; None for all.
 
     Raises:
         UserError: the file is unusable.

@@ -33,13 +33,13 @@ DEFAULT_WIDTH = 160
 
 
 def image_key(camera: str) -> str:
-    """The name of a camera's images."""
+    """The name of a camera's images in LeRobot datasets and environments."""
     return f"observation.images.{camera}"
 
 
 @dataclass(frozen=True)
 class FrameSettings:
-    """How episodes are recorded."""
+    """Settings of the recording of episodes as frames."""
 
     fps: int = DEFAULT_RATE
     """Frames per simulated second, one of `RATES`."""

@@ -32,7 +32,7 @@ side for both axes; here shifts along the longer side are twice as large."""
 
 
 class Pictured(Protocol):
-    """An object whose image is made on demand."""
+    """Anything with an observed image, which may be computed on demand."""
 
     @property
     def image(self) -> Image:

@@ -48,7 +48,7 @@ class ObservedScene:
 
     recorded: Pictured
     actions: tuple[PickPlaceAction, ...]
-    """The expert's own action comes first."""
+    """The actions that the expert may take next. The one that it took comes first."""
     grid: PixelGrid
 
     @property

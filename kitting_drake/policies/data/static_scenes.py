@@ -56,7 +56,7 @@ class StaticScene:
     """One observed scene."""
 
     height: NDArray[np.uint16]
-    """(rows, cols), in steps of 0.1 mm."""
+    """(rows, cols) heights above the table, in steps of 0.1 mm."""
     actions: NDArray[np.float64]
     """(m, 8) the scene's actions, one in each row, with the columns of the file."""
 
@@ -131,7 +131,7 @@ def write_static_scenes(path: Path, content: StaticScenes) -> None:
         file.attrs["versions"] = json.dumps(content.versions)
         heights = np.array([scene.height for scene in content.scenes], np.uint16)
         heights = heights.reshape(-1, *content.grid.shape)
-        # HDF5 does not chunk an empty dataset.
+        # HDF5 cannot store an empty dataset in chunks.
         packed: dict[str, Any] = {"chunks": (1, *content.grid.shape), "compression": "gzip"}
         file.create_dataset("height", data=heights, **(packed if len(heights) else {}))
         file["actions"] = np.concatenate([np.zeros((0, 8)), *(s.actions for s in content.scenes)])

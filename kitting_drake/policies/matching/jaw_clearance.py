@@ -95,7 +95,7 @@ def jaw_grasps(
         segmentation: the segmentation of the observation.
         region: the object.
         resolution: the side of a pixel, in metres.
-        planner: how deep the fingertips go, and how wide the jaws open.
+        planner: parameters that say how deep the fingertips go and how wide the jaws open.
         support: height of the object's support above the table, in metres.
         balance: (row, col) of the object's centre of mass, if known. Otherwise the centre of the
             volume below its surface is used.

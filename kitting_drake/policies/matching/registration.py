@@ -26,13 +26,13 @@ from kitting_drake.policies.matching.segmentation import Mask, Region
 Array = NDArray[np.float64]
 
 _SUBSAMPLING = 3
-"""Fine pixels per pixel of o_t."""
+"""Number of fine pixels per pixel of o_t, along each axis."""
 _CLOSING_RADIUS = 0.008
 """Notches of an object that are narrower than twice this are missing in its recess, in metres."""
 _BAND = 0.006
 """The cost is computed at points within this distance of the object's outline, in metres."""
 _FARTHEST = 0.012
-"""Distances are clipped to this, in metres."""
+"""Signed distances are clipped to plus or minus this, in metres."""
 _ROBUST = 0.002
 """Residuals larger than this, in metres, add no more to the cost than one of this size: they come
 from hidden or touching parts.

@@ -117,7 +117,7 @@ class Region:
 
     @property
     def pixels(self) -> NDArray[np.intp]:
-        """(n, 2): the row and column of each pixel."""
+        """(n, 2): row and column of each pixel of the region."""
         return np.argwhere(self.mask)
 
 

@@ -55,7 +55,7 @@ class Visibility:
 
     @classmethod
     def of(cls, observation: Observation) -> Visibility:
-        """The visibility of an observation."""
+        """Finds which pixels of an observation are seen."""
         grid: PixelGrid = observation.grid
         return cls(observation.valid, observation.in_view, grid.resolution)
 

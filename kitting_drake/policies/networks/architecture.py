@@ -16,10 +16,10 @@ METHODS = ("so2", "equivariant_transporter", "transporter")
 
 @dataclass(frozen=True)
 class Preset:
-    """The size of the networks of each method."""
+    """A named set of sizes for the networks of all methods."""
 
     unet: UNetSize = field(default_factory=UNetSize)
-    """The U-nets alpha, phi and psi."""
+    """The size of the U-nets alpha, phi and psi."""
     samples: int = 16
     """The number of samples of each SO(2) field of the U-nets, on which the nonlinearity acts."""
     angle: AngleNetSize = field(
@@ -27,7 +27,7 @@ class Preset:
             stages=((16,), (32, 32), (16, 16), (16, 16), (8,)), residual=True
         )
     )
-    """The pick-angle network beta."""
+    """The size of the pick-angle network beta."""
     angle_band: int = 6
     """The cutoff frequency j_c of beta's hidden fields."""
     angle_samples: int = 32
@@ -119,7 +119,7 @@ class NetworkConfig:
     band: int = BAND
     """The cutoff frequency j_c of the U-nets' fields."""
     angle_frequencies: tuple[int, ...] = ANGLE_FREQUENCIES
-    """The frequencies of beta's output."""
+    """The frequencies of the output of the pick-angle network beta."""
     colour: bool = True
     """Whether the networks see colours. Otherwise they see only heights, with unseen pixels filled
     in (see `systems.signals.fill_unseen`)."""
@@ -152,5 +152,5 @@ class NetworkConfig:
         return (own.unet, own.samples) == (other.unet, other.samples)
 
     def as_dict(self) -> dict[str, Any]:
-        """The fields as JSON values."""
+        """Returns the fields as JSON values."""
         return dataclasses.asdict(self)

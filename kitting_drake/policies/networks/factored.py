@@ -89,7 +89,7 @@ class Networks(nn.Module):
     phi: nn.Module
     psi: nn.Module
     picking: str
-    """The name of the loss of the pick position."""
+    """The name of the loss that trains the pick position."""
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()

@@ -85,7 +85,7 @@ def presence_loss(odds: Tensor, *, present: bool) -> Tensor:
     """The cross-entropy of the classes "something to pick" and "nothing to pick".
 
     Args:
-        odds: see `log_odds`.
+        odds: the result of `log_odds`.
         present: whether there is something to pick.
     """
     return F.softplus(-odds if present else odds)

@@ -80,7 +80,7 @@ def save_weights(path: Path, networks: Networks, card: dict[str, Any]) -> None:
     Args:
         path: the file; it is written atomically.
         networks: networks with steerable convolutions.
-        card: see `WeightsFile`; must be serializable as JSON.
+        card: the origin of the weights, see `WeightsFile`; it must be serializable as JSON.
     """
     tensors: dict[str, Tensor] = {}
     bases: dict[str, str] = {}

@@ -11,7 +11,7 @@ from kitting_drake.policies.networks.architecture import NetworkConfig
 
 def normalisation(observed: list[ObservedScene]) -> dict[str, float]:
     """Computes the normalisation fields of a `NetworkConfig` from observations."""
-    # A generator keeps only one image in memory.
+    # Use a generator, so that only one image at a time is in memory.
     images = (scene.recorded.image for scene in observed)
     moments = np.array([[_moments(image[:3]), _moments(image[3])] for image in images])
     default = NetworkConfig()

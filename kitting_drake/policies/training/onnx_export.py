@@ -23,7 +23,7 @@ from kitting_drake.policies.networks.unet import STRIDE
 from kitting_drake.policies.networks.weights import load_networks, read_weights_file
 
 GRAPHS = ("alpha", "beta", "phi", "psi")
-"""The exported networks, one file each."""
+"""Names of the exported networks. Each is written to its own file."""
 _OPSET = 17
 
 
@@ -81,7 +81,7 @@ def export_onnx(weights: Path, folder: Path) -> list[Path]:
     require_folder(folder)
     config = networks.config
     written = []
-    # Written last, as the completion marker.
+    # Write this file last, because it marks a complete export.
     described_in = folder / "policy.json"
     described_in.unlink(missing_ok=True)
     for name in GRAPHS:

@@ -29,7 +29,7 @@ class _Draw:
     random: np.random.Generator
     """The generator for the random draws of the losses."""
     final: Image | None
-    """A final observation; None in most steps."""
+    """A final observation, from which the networks learn to stop; None in most steps."""
     stop_random: np.random.Generator
     """The generator for the random draws of the stop loss."""
 

@@ -47,7 +47,9 @@ def check_yaml(schema: Any, value: Any, where: str) -> None:
     elif dataclasses.is_dataclass(schema):
         if isinstance(value, dict) and "_tag" in value:
             tag = str(value["_tag"]).lstrip("!")
-            raise ValueError(f"{where or 'the scenario'} has the tag !{tag}, but takes none")
+            raise ValueError(
+                f"{where or 'the scenario'} has the tag !{tag}, but this field takes no tag"
+            )
         _check_dataclass(schema, value, where)
     else:
         _check_scalar(schema, value, where)

@@ -1,4 +1,4 @@
-"""Kitting with given poses of tools and kit."""
+"""The kitting task in which the poses of tools and kit are given."""
 
 import dataclasses
 from dataclasses import dataclass, field

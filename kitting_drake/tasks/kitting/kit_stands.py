@@ -1,4 +1,4 @@
-"""Risers under kits, and tilts of kits."""
+"""Places kits on risers, and tilts kits."""
 
 import hashlib
 import math

@@ -23,7 +23,7 @@ from systems.signals import PixelGrid
 FACES = ("as_drawn", "any")
 """The allowed values of a task's `faces`: the faces on which tools may lie."""
 TRAY = MODELS / "tray" / "tray.sdf"
-"""The model of the tray."""
+"""The SDFormat file of the tray."""
 TRAY_SIZE = (0.380, 0.290, 0.020)
 """Outer extents of the tray along x, y and z of its frame, in metres. The origin of the frame is
 the middle of the tray's bottom."""

@@ -14,7 +14,7 @@ from kitting_drake.hkd.kits.kit import Kit
 from kitting_drake.hkd.tools.tool import Tool
 
 KIT = -1
-"""The kit's index in `Group.members`."""
+"""The key of the kit in `Group.members`."""
 
 _GAP = 0.003
 """Largest gap between touching tools, in metres."""
@@ -206,4 +206,4 @@ GROUPS: dict[str, Callable[..., list[Group]]] = {
 }
 """The function that draws the groups, for each kind of start."""
 START_KINDS = tuple(GROUPS)
-"""How the tools may lie at the start."""
+"""The kinds of starts: the ways in which tools may lie."""

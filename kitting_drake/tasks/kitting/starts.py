@@ -153,7 +153,9 @@ def check_start(start: str, tray: bool, faces: str, distractors: int) -> None:
     if tray and start == "leaning":
         raise ValueError("task.tray must be false if task.start is leaning")
     if distractors and (tray or start != APART):
-        raise ValueError("task.distractors must be 0 unless task.start is apart, without a tray")
+        raise ValueError(
+            "task.distractors must be 0 unless task.start is apart and task.tray is false"
+        )
 
 
 def cluttered_scene(

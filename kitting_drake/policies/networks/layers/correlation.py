@@ -27,7 +27,7 @@ KERNEL = 65
 COARSE_ROTATIONS = 48
 """The number of rotations of the coarse volume."""
 _REACH = 4
-"""How far around a coarse cell the full correlation is evaluated, in pixels."""
+"""The full correlation is evaluated up to this far from a coarse cell's pixel, in pixels."""
 
 
 def lift(encoding: Tensor, angles: Tensor, size: int) -> Tensor:
@@ -234,7 +234,7 @@ class Candidate:
     """The pixel (row, col) of `scores[:, 0, 0]`; all pixels lie in the scene."""
 
     def best(self) -> tuple[float, int, int, int]:
-        """(score, bin, row, col) of the largest score."""
+        """The largest score with its position, as (score, rotation bin, row, col)."""
         rotation, row, col = _argmax(self.scores)
         score = float(self.scores[rotation, row, col])
         return score, self.first_bin + rotation, self.corner[0] + row, self.corner[1] + col

@@ -61,9 +61,9 @@ def discretize(
 
     Args:
         coefficients: (..., d) Fourier coefficients.
-        orientations: as for `discretization_matrix`.
-        frequencies: as for `discretization_matrix`.
-        quotient: as for `discretization_matrix`.
+        orientations: N, the number of bins over a full rotation.
+        frequencies: frequencies j of the irreps, ascending.
+        quotient: order of the subgroup, see `discretization_matrix`.
 
     Returns:
         (..., N / quotient): the function at the angles 2 pi i / N.

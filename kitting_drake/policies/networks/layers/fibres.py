@@ -42,7 +42,7 @@ class Fibre(Protocol):
 
 @dataclass(frozen=True)
 class Scalar:
-    """The trivial representation rho_0."""
+    """The trivial representation rho_0: a scalar field."""
 
     size: int = 1
     channels: int = 1

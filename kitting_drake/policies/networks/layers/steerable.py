@@ -321,7 +321,7 @@ def _multiply_fields(features: Tensor, matrix: Tensor) -> Tensor:
 
     Args:
         features: (batch, fields * channels, rows, cols), in channels_last.
-        matrix: from `_of_several_fields`.
+        matrix: a result of `_of_several_fields`.
     """
     last = features.permute(0, 2, 3, 1)
     product = last.reshape(-1, len(matrix)) @ matrix.to(features.dtype)

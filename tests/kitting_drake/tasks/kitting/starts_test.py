@@ -103,7 +103,9 @@ def test_an_impossible_start_raises(monkeypatch: pytest.MonkeyPatch):
     with pytest.raises(UserError, match=r"^task\.start: 'crossed' needs at least two tools$"):
         draw(0, tools=TWO[:1], start="crossed")
     small = PixelGrid(rows=100, cols=110)
-    with pytest.raises(UserError, match=r"^task\.start: no start 'heap' of 2 tools was found"):
+    with pytest.raises(
+        UserError, match=r"^task\.start: no valid start 'heap' with 2 tools was found"
+    ):
         Kitting(tools=TWO, start="heap").make_scene(grid=small, seed=0, base=Path())
 
 
