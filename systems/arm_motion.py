@@ -89,7 +89,7 @@ class ArmMotion(JawMotion):
             base: pose of the arm's base in the world.
             obstacles: fixed bodies that the arm must not touch, in the world.
             highest_wait: upper limit of the height at which the hand waits, in m.
-            inertia: model of the arm's inertia; None: the rates of the torques are not limited.
+            inertia: model of the arm's inertia; if None, torque rates are not limited.
 
         Raises:
             ValueError: the arm cannot reach the home pose.

@@ -57,7 +57,7 @@ def reach_problem(
         postures: chooses the arm's postures.
         stops: the stops of `hand_stops`. If the jaws are turned by half a turn at one stop, they
             are turned at all.
-        now: (7) present joint positions; None: the middle of their ranges.
+        now: (7) present joint positions, in rad; if None, the middles of the joints' ranges.
     """
     if now is None:
         now = (np.array(postures.limits.lower) + postures.limits.upper) / 2

@@ -42,7 +42,7 @@ class ArmStop:
             v: (7) joint velocities at the beginning, in rad/s.
             a: (7) joint accelerations at the beginning, in rad/s^2.
             limits: limits of the joints; only those of acceleration, jerk and torque rate are used.
-            inertia: model of the arm's inertia; None: the rates of the torques are not limited.
+            inertia: model of the arm's inertia; if None, torque rates are not limited.
         """
         self.goal, self.duration = q, 0.0
         """The positions (7), in rad, in which the joints come to rest, and how long that takes, in

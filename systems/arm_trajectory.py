@@ -174,7 +174,8 @@ def plan_action(
         parameters: the parameters of `motion`.
         action: a pick and place, or a press.
         surfaces: heights of the surfaces around pick and place.
-        joints: (7) where the arm starts, at rest; None: `motion.home_joints`.
+        joints: (7) joint positions at which the arm starts, at rest, in rad; `motion.home_joints`
+            if None.
         rate: rate of the points, in Hz, from `SLOWEST_RATE` to `FASTEST_RATE`.
 
     Returns:

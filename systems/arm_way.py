@@ -1,5 +1,5 @@
-"""One motion, here called a way, of a Franka arm: it first brakes to a stop, then follows a
-path."""
+"""Plans one motion of a Franka arm, which is called a way here. The arm first brakes to a stop,
+then follows a path."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ class ArmWay:
         Args:
             vector: a `WayVector`.
             postures: chooses the arm's postures.
-            inertia: model of the arm's inertia; None: the rates of the torques are not limited.
+            inertia: model of the arm's inertia; if None, torque rates are not limited.
         """
         self._inertia = inertia
         self._postures, self._limits = postures, postures.limits

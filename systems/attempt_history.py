@@ -117,7 +117,7 @@ class LeftOverVector:
         self._vector = vector
 
     def write(self, left_over: LeftOver | None) -> None:
-        """Keeps the first `MOST_LEFT_OVER` objects and cavities."""
+        """Stores a `LeftOver`, with at most `MOST_LEFT_OVER` of its objects and of its cavities."""
         self._vector[:] = np.nan
         self._vector[0] = left_over is not None
         if left_over is None:

@@ -98,8 +98,8 @@ class ClutterExpert:
             in_cavity = displacement(item, X_WGoal, self._poses[index]) < _IN_CAVITY
         arguments = (index, self._poses, self._points)
         holds = self._table.holds(*arguments, self._failed, ignores_fixtures=in_cavity)
-        # If every grasp has failed, try them all again. If there is none, try grasps that may slip:
-        # they at least move the object.
+        # If every grasp has failed, try them all again. If the object has no good grasp, try grasps
+        # that may slip: they at least move the object.
         return (
             holds
             or self._table.holds(*arguments, ignores_fixtures=in_cavity)

@@ -39,7 +39,7 @@ class JawMotion:
             state: the planner's state; modified.
             mode: the mode to begin.
             time: the present time, in s.
-            opening: stop the jaws at this opening, in m; None: at the present command.
+            opening: the opening at which the jaws stop, in m; if None, the presently commanded one.
         """
         parameters = self._parameters
         if opening is None:

@@ -240,7 +240,7 @@ class OraclePolicy(LeafSystem):
             poses: X_WB of each of the n objects.
             placements: the present placement of each object.
             kept: indices of goals that count as filled.
-            tried: (n,) how often each object was tried; None: not at all.
+            tried: (n,) how often each object was tried; None if none was tried.
         """
         filled = kept | {item.goal for item in placements if item.success}
         failed_there = {

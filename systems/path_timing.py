@@ -196,7 +196,7 @@ def plan_motion(
         limits: limits of the joints; they hold exactly.
         extra: (n, rows) other quantities that are limited along the path, such as a height.
         bounds: limits of the rows of `extra`; a motion may exceed them by a few percent.
-        inertia: model of the arm's inertia; None: the rates of the torques are not limited.
+        inertia: model of the arm's inertia; if None, torque rates are not limited.
     """
     low, high = braking_bounds(limits, points)
     rows = RowLimits(
@@ -217,7 +217,7 @@ def plan_motion(
         if rate <= 1.0 or averaged == _MOST_AVERAGED:
             return motion
         averaged = min(max(math.ceil(averaged * rate), averaged + 1), _MOST_AVERAGED)
-    raise RuntimeError("no motion along the path keeps the limits of the joints")
+    raise RuntimeError("no motion along the path stays within the limits of the joints")
 
 
 def _sample(

@@ -240,7 +240,7 @@ class PickPlaceAction:
     """The objects and cavities that a policy still sees when it stops; None if it does not report
     them."""
     heights: SurfaceHeights | None = None
-    """Heights of the surfaces around pick and place. None: the planner reads them off o_t."""
+    """Heights of the surfaces around pick and place. If None, the planner reads them off o_t."""
 
     @property
     def poses(self) -> dict[str, PlanarPose]:

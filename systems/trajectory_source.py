@@ -1,4 +1,4 @@
-"""Plays back a joint trajectory into an arm's controller."""
+"""Feeds a planned joint trajectory to an arm's controller."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ class JointView:
         """
         Args:
             station: the station, with cameras.
-            recording: chooses cameras and image size.
+            recording: the settings, which name cameras and image size.
 
         Raises:
             UserError: there is no such camera.

@@ -146,7 +146,8 @@ def _stop_reasons(episodes: Sequence[Episode]) -> dict[str, dict[str, int]]:
 
 
 def peak_forces(episodes: Sequence[Episode]) -> list[Entry]:
-    """The larger of the vertical and the lateral peak force of each action, in N, as `force`."""
+    """An entry for each action. Its `force` is the larger of the action's vertical and lateral peak
+    force, in N."""
     peaks = [
         action.get("peak_force_n") for episode in episodes for action in episode["actions_taken"]
     ]

@@ -75,7 +75,7 @@ class Variation:
     """Random variation of all models except the robot."""
 
     # The friction coefficients of each model are multiplied by a random factor between 1 - value
-    # and 1 + value. `mass` does the same for its mass.
+    # and 1 + value. `mass` is the corresponding range for the model's mass.
     friction: float = bounded(0.0, 0.0, 0.9)
     mass: float = bounded(0.0, 0.0, 0.9)
 

@@ -101,5 +101,5 @@ class FinalObservation(Recorded):
 
 
 def record(observation: Observation) -> Recorded:
-    """An observation with its colours rounded to 8 bits."""
+    """Makes a recorded observation, with colours rounded to 8 bits."""
     return Recorded(np.rint(observation.rgb * 255).astype(np.uint8), observation.height.copy())

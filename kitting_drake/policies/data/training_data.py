@@ -111,7 +111,8 @@ class TrainingData:
         """The observations with something to pick.
 
         Args:
-            most: the largest number of observations, chosen evenly; None for all.
+            most: the largest number of observations to return, which are chosen evenly; None for
+                all.
         """
         if not isinstance(self.items, StaticScenes):
             possible = self.learning.later_picks_possible

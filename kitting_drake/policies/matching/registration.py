@@ -1,7 +1,7 @@
 """Registers an object's outline to that of a recess, to less than a pixel.
 
-Both outlines are signed distances on a grid that is finer than that of o_t. A recess has the
-object's outline, with its narrow notches closed and enlarged by a clearance (see
+Both outlines are signed distances on a grid that is finer than that of o_t. The outline of a recess
+is that of its object, with narrow notches closed, enlarged by a clearance (see
 `kitting_drake.hkd.kits.layout`). The notches of the object's outline are therefore closed first.
 The remaining offset between the outlines is fitted. It is the clearance plus about half a pixel,
 because a view from above makes objects wider and recesses narrower.

@@ -83,7 +83,8 @@ class AngleNet(MixedPrecision):
                 # A residual block applies its own ELU.
                 is_block = isinstance(layer, ResidualBlock)
                 features = layer(features) if is_block else F.elu_(layer(features))
-        # The readout always computes in float32: angles need more than eight bits.
+        # The readout always computes in float32, because angles need more than the eight bits of
+        # bfloat16.
         return self.readout(features.float()).mean(dim=(2, 3))
 
     def reduced_precision_parts(self) -> Iterator[nn.Module]:

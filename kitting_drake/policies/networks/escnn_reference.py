@@ -72,7 +72,8 @@ class EscnnUNet(nn.Module):
                 # escnn's R2Upsampling computes the same, but needs the size at construction.
                 larger = enn.GeometricTensor(upsample(features.tensor), features.type)
                 features = block(enn.tensor_directsum([larger, levels.pop()]))
-            # escnn distinguishes frequency 0 alone from the trivial representation.
+            # Change the type of the field: to escnn, frequency 0 alone differs from the trivial
+            # representation.
             scalars = enn.GeometricTensor(features.tensor, self.mix.in_type)
             return self.out(self.mix_elu(self.mix(scalars))).tensor.float()
 

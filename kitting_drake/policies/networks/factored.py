@@ -192,7 +192,8 @@ class Networks(nn.Module):
     def losses(
         self, sample: LabelledImage, random: np.random.Generator
     ) -> Iterator[tuple[str, Callable[[], Tensor]]]:
-        """Each module's name and a function that computes its loss on a sample."""
+        """Yields the name of each module and a function that computes the module's loss on a
+        sample."""
         sample = within_image(sample)
         pixels = [jittered(pick, random) for pick in (sample.pick, *sample.other_picks)]
         seed = int(random.integers(2**62))

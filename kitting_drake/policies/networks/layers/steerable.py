@@ -190,7 +190,8 @@ class PlainConv2d(nn.Conv2d):
 
 
 @functools.lru_cache(maxsize=64)
-@torch.inference_mode(False)  # escnn caches tensors, which must work outside inference mode too.
+# escnn caches tensors, which must also work outside inference mode, so switch it off here.
+@torch.inference_mode(False)
 def kernel_basis(in_fibre: Fibre, out_fibre: Fibre, size: int) -> Tensor:
     """escnn's basis of the steerable kernels between two fibres, with the Fourier transforms folded
     in.
