@@ -232,18 +232,18 @@ def only_stop(folder: Path) -> None:
         (action("demo1/step9", {"pick": POSES["pick"]}), "place must have x, y and yaw"),
         (
             action("demo1/step9", {**POSES, "pick": {**POSES["pick"], "yaw": 17}}),
-            "pick.yaw is 17, more than a rotation: it is in radians",
+            "pick.yaw is 17, more than a full turn: give it in radians",
         ),
         (action("demo1/step9", {"stop": "yes"}), "stop must be true or false, not 'yes'"),
         (action("demo1/step9", {**POSES, "press": True}), "presses down"),
-        (action("demo1/step9", {**POSES, "object": 3}), "object must be a text, not 3"),
-        (action("demo1/step9", {**POSES, "object": "a\0b"}), "must be of printable characters"),
+        (action("demo1/step9", {**POSES, "object": 3}), "object must be a string, not 3"),
+        (action("demo1/step9", {**POSES, "object": "a\0b"}), "must have only printable characters"),
         (action("demo1/step9", {"stop": True}), "demo1/step9 says that nothing is left to do, but"),
         (action("demo1/step9", {**POSES, "calibration": "0"}), "clicked with another calibration"),
         (small, "demo2/step1: .* but camera front was calibrated at 640x480"),
-        (empty, "demo3 holds no steps"),
+        (empty, "demo3 has no steps"),
         (copied, "demo2 and demo3 hold the same frames"),
-        (only_stop, "demo3 holds only a last step"),
+        (only_stop, "demo3 has only a last step"),
     ],
 )
 def test_invalid_demonstrations_are_refused(
@@ -264,7 +264,7 @@ def test_invalid_demonstrations_are_refused(
 def test_folders_without_demonstrations_are_refused(tmp_path: Path):
     with pytest.raises(UserError, match="there is no folder"):
         find_demonstrations(tmp_path / "none")
-    with pytest.raises(UserError, match="holds no demonstrations"):
+    with pytest.raises(UserError, match="has no demonstrations"):
         find_demonstrations(tmp_path)
 
 

@@ -167,7 +167,7 @@ def test_from_starts_with_given_weights(
     told = refused(
         write(tmp_path / "finer.h5", range(20, 24), finer), tmp_path / "no", "--from", start
     )
-    assert "learned from pixels of 0.003125 m" in told
+    assert "was trained with pixels of 0.003125 m" in told
     assert "finer.h5 has pixels of 0.002 m" in told
 
 
@@ -244,7 +244,7 @@ def test_rotations_of_a_transporter(
         patch.setattr(sys, "argv", ["train", *words(demos, tmp_path, "--rotations", 8)])
         training.main()
     assert left.value.code == 2
-    assert "--rotations is for --method transporter" in capsys.readouterr().err
+    assert "--rotations is only for --method transporter" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

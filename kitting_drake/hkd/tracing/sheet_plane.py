@@ -143,8 +143,8 @@ def _choose(
     ratio = max(ratio, 1 / ratio)
     wanted = "A4 (1.414) or Letter (1.294)" if size is None else f"{max(size) / min(size):.3f}"
     raise UserError(
-        f"{photo.path}: the sides of the largest sheet found are as {ratio:.3f} to 1, not {wanted}: "
-        "show the whole sheet, flat, or give its size with --sheet LENGTH WIDTH"
+        f"{photo.path}: the sides of the largest sheet found are as {ratio:.3f} to 1, not "
+        f"{wanted}: show the whole sheet, flat, or give its size with --sheet LENGTH WIDTH"
     )
 
 

@@ -62,8 +62,8 @@ def changeable(summary: Mapping[str, Any]) -> Changeable:
     - At least F - n actions follow a failed grasp: in each episode, all failed grasps but the first
       one follow it.
     - At most all actions of n episodes follow a failed grasp, except the first action of each,
-      which is the failed one. In the other episodes each placed object took an action. So the bound is
-      largest if the n episodes are those with the fewest placed objects.
+      which is the failed one. In the other episodes each placed object took an action. So the bound
+      is largest if the n episodes are those with the fewest placed objects.
 
     Args:
         summary: the summary that `evaluate` wrote for a learned policy. If it has no number of

@@ -209,7 +209,7 @@ def test_the_page_of_results_shows_the_cost_of_angles(measured: dict[str, Any], 
     assert NAMES["transporter"] not in table
     for damaged in ({"machine": 7}, measured | {"pick_angle": []}, []):
         path.write_text(json.dumps(damaged))
-        with pytest.raises(UserError, match="not a file of benchmark networks"):
+        with pytest.raises(UserError, match="was not written by benchmark networks"):
             read_efficiency(tmp_path)
 
 

@@ -23,5 +23,5 @@ def test_most_verdicts_agree():
 def test_an_oracle_that_releases_nothing_is_an_error(monkeypatch: pytest.MonkeyPatch):
     pytest.importorskip("mujoco")
     monkeypatch.setattr(second_opinion, "_episode", lambda *_: SimpleNamespace(releases={}))
-    with pytest.raises(UserError, match="nothing was released in 5 episodes"):
+    with pytest.raises(UserError, match="no tool was released in 5 episodes"):
         ask_mujoco(8, 0, 2, Console(quiet=True))
