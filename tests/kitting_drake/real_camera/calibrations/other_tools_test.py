@@ -251,7 +251,7 @@ K = "width: 64\n    height: 48\n    k: [50, 0, 31.5, 0, 51, 23.25, 0, 0, 1]\n"
         (K + "    d: [0.1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0.01, 0]\n", "d has a tilted sensor"),
         (K + "    binning_x: 2\n", "binning_x is 2, so the images are smaller"),
         (K + "    roi: {x_offset: 8, y_offset: 0, width: 32, height: 48}\n", "images are cropped"),
-        (K + "    distortion_model: equidistant\n", "equidistant needs distortion"),
+        (K + "    distortion_model: equidistant\n", "equidistant needs four numbers"),
         (K + "    distortion_model: equi\n    d: [0.1, 0]\n", "d must hold 4 numbers, not 2"),
         (K + "    distortion_model: omni\n    d: [0.1, 0]\n", "distortion_model omni cannot be"),
         (K + "    image_Width: 64\n", "has width and image_Width: give one of them"),
