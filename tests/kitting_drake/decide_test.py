@@ -467,7 +467,7 @@ def test_a_mostly_unseen_table_is_refused():
     assert decide({"front": Frame(color, depth)}, front, ShapeMatching()).action.stop
     depth[:, 200:] = 0
     decision = decide({"front": Frame(color, depth)}, front, ShapeMatching())
-    assert decision.result == "not seen" and "of what is in view is seen" in decision.reason
+    assert decision.result == "not seen" and "of the pixels in view are measured" in decision.reason
 
 
 def test_a_near_camera_that_sees_mostly_a_kit_is_accepted():

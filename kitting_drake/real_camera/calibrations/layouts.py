@@ -137,7 +137,9 @@ def _read_distortion(node: dict[str, Any], where: str) -> tuple[tuple[float, ...
     key = refuse_two(node, _DISTORTIONS, where)
     if key is None:
         if model == EQUIDISTANT:
-            raise UserError(f"{where}: distortion_model equidistant needs four numbers in distortion")
+            raise UserError(
+                f"{where}: distortion_model equidistant needs four numbers in distortion"
+            )
         return (), BROWN
     values = tuple(numbers(node[key], f"{where}: {key}").tolist())
     values = checked_coefficients(model, values, f"{where}: {key}")
