@@ -445,8 +445,8 @@ def test_missing_depths_are_unseen_pixels():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (spoil(lambda depth: 1000 * depth), "these are millimetres"),
-        (as_png(1.0), "these are metres"),
+        (spoil(lambda depth: 1000 * depth), "seem to be millimetres"),
+        (as_png(1.0), "seem to be metres"),
         (as_png(4000.0), "depth_scale: 0.00025 would agree"),
         (spoil(lambda depth: 0 * depth), "depth of camera front is all zero or NaN"),
         (spoil(lambda depth: np.nan * depth), "depth of camera front is all zero or NaN"),
