@@ -62,7 +62,7 @@ class ArmPostures:
         Args:
             limits: limits of the joints.
             base: pose of the arm's base in the world.
-            obstacles: fixed bodies that it must not touch, in the world.
+            obstacles: fixed bodies that the arm must not touch, in the world.
         """
         self.limits, self.base, self._obstacles = limits, base, tuple(obstacles)
         self._lower = np.array(limits.lower) + MARGIN

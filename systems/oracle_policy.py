@@ -374,8 +374,8 @@ class OraclePolicy(LeafSystem):
         if quantizer is not None:
             pick = PlanarPose(*quantizer.position(pick.x, pick.y), quantizer.angle(pick.theta))
             held = grasp_taken(X_WB, pick)
-        # A level object that is lowered into a tilted cavity touches its floor under half of its
-        # height.
+        # The gripper lowers a level object into a tilted cavity. It takes the (x, y) that a point
+        # at half of the object's height has in the goal pose.
         height = plan.grasp.surface_height / 2 if is_tilted(plan.X_WGoal) else 0.0
         place = gripper_pose(plan.X_WGoal, held, height)
         theta = wrap_to_pi(pick.theta)

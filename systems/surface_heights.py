@@ -62,7 +62,7 @@ def read_surface_heights(
       lower. Motions that stop at a contact may aim too low, but must not end too high.
 
     Args:
-        observation: o_t.
+        observation: the observation o_t.
         pick: the gripper's pose at the pick, in the world.
         place: the gripper's pose at the place, in the world. Off the grid, heights are zero.
     """

@@ -43,7 +43,7 @@ def draw_decision(observation: Observation, decision: Decision, *, title: str = 
         title: the title of the picture; empty for the kind of action.
 
     Returns:
-        A PNG.
+        The picture as PNG.
     """
     figure = Figure(figsize=(12, 8), layout="constrained", dpi=110)
     axes = figure.subplot_mosaic(
@@ -70,7 +70,7 @@ def draw_action(observation: Observation, action: PickPlaceAction, *, title: str
         title: the title of the picture; empty for the kind of action.
 
     Returns:
-        A PNG.
+        The picture as PNG.
     """
     figure = Figure(figsize=(12, 3.5), layout="constrained", dpi=110)
     axes = figure.subplot_mosaic([["colour", "height"]])
@@ -92,7 +92,7 @@ def draw_maps(observation: Observation, decision: Decision, *, width: int) -> by
         width: the width of the picture, in pixels; its height follows from the maps.
 
     Returns:
-        A PNG.
+        The picture as PNG.
     """
     rows, cols = observation.height.shape
     dpi, gap, title = 100, 4, 20

@@ -23,8 +23,7 @@ TIMED_OUT = "timed out"
 """The cause of all objects of an episode that timed out."""
 
 UNKNOWN = "unknown"
-"""The category of the single object that a failed episode counts as if no other episode has
-objects."""
+"""If no other episode has objects, a failed episode counts as a single object of this category."""
 
 AMBIGUITIES = {
     "protruding": ("height_error_mm", 1e3 * STRICT_HEIGHT),

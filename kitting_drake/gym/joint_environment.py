@@ -72,7 +72,7 @@ class JointEnvironment(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32
         Args:
             scenario: a scenario file, or the name of one of the project's.
             scenario_name: name of a scenario in the file; None for the first.
-            scenario_text: YAML merged over it, such as `{robot: !FrankaArm {}}`.
+            scenario_text: YAML that is merged over the scenario, such as `{robot: !FrankaArm {}}`.
             perturb: perturbations, as for `--perturb`.
             fps: steps per simulated second.
             image_width: largest width of the images, in pixels.

@@ -1,4 +1,4 @@
-"""The data of a training run or its validation: demonstrations or static scenes."""
+"""Data for training or validation, from demonstrations or static scenes."""
 
 from __future__ import annotations
 
@@ -44,12 +44,13 @@ _NO_SCENE = (
     *("tries", "random_order", "distractors"),
     *("success_threshold", "position_threshold", "angle_threshold_deg"),
 )
-"""Task fields that do not affect the scene. (`distractors` adds boxes to it, but moves nothing.)"""
+"""Task fields that do not affect the scene. (`distractors` adds boxes to the scene, but moves
+nothing else.)"""
 
 
 @dataclass(frozen=True)
 class TrainingData:
-    """Observations and labels of one origin."""
+    """Observations and labels from one file."""
 
     scenario: str
     origin: dict[str, Any]
@@ -62,8 +63,8 @@ class TrainingData:
     """The seeds of the demonstrations, or the first seed of static scenes."""
     items: tuple[Demonstration, ...] | StaticScenes
     made_by: dict[str, str]
-    """The versions that made the data and a digest of its content. They distinguish data with the
-    same seeds."""
+    """The versions of the packages that made the data, and a digest of the data. They distinguish
+    data sets with the same seeds."""
 
     @property
     def count(self) -> int:
@@ -72,12 +73,12 @@ class TrainingData:
 
     @property
     def kind(self) -> str:
-        """The name of its items, for messages."""
+        """The name of the items, for messages."""
         return "scenes" if isinstance(self.items, StaticScenes) else "demonstrations"
 
     @property
     def has_taken(self) -> bool:
-        """Whether the data record the expert's own picks rather than only possible ones."""
+        """Whether the data tell which of the possible picks the expert took."""
         return not isinstance(self.items, StaticScenes)
 
     @property
@@ -87,7 +88,8 @@ class TrainingData:
 
     @property
     def unrelated(self) -> tuple[int, ...]:
-        """The numbers of items after which the data can be split into unrelated parts.
+        """The positions at which the data can be split into unrelated parts, as numbers of items
+        before the split.
 
         Static scenes share tools within a batch; demonstrations are independent.
         """
@@ -96,7 +98,7 @@ class TrainingData:
         return tuple(range(1, self.count + 1))
 
     def part(self, first: int, last: int) -> TrainingData:
-        """The items from `first` up to `last`."""
+        """The items from index `first` up to but not including `last`."""
         if isinstance(self.items, StaticScenes):
             return dataclasses.replace(self, items=self.items.part(first, last))
         items = self.items[first:last]
@@ -108,7 +110,7 @@ class TrainingData:
         )
 
     def scenes(self, most: int | None = None) -> list[ObservedScene]:
-        """The observations with something to pick.
+        """The observations in which something is left to pick.
 
         Args:
             most: the largest number of observations to return, which are chosen evenly; None for
@@ -129,7 +131,7 @@ class TrainingData:
         return result
 
     def finals(self, most: int | None = None, *, colour: bool = True) -> Sequence[Pictured]:
-        """The observations with nothing left to pick. The arguments are those of `scenes` and
+        """The observations in which nothing is left to pick. For the arguments see `scenes` and
         `samples`."""
         if not isinstance(self.items, StaticScenes):
             found = evenly_chosen(final_observations(self.items), most)
@@ -138,10 +140,10 @@ class TrainingData:
         return [_recorded(FinalObservation, item.image) for item in evenly_chosen(seated, most)]
 
     def samples(self, *, taken_only: bool, colour: bool = True) -> Sequence[LabelledImage]:
-        """The training samples, of the observations with something to pick.
+        """The training samples, from the observations in which something is left to pick.
 
         Args:
-            taken_only: see `labelled_images`.
+            taken_only: whether to use only the actions that the expert took, see `labelled_images`.
             colour: whether the networks see colours. If not, unseen pixels are filled in, as at
                 inference.
         """
@@ -155,15 +157,15 @@ class TrainingData:
         return labelled_images(found, taken_only=taken_only)
 
     def shares_scenes(self, other: TrainingData) -> int | None:
-        """A seed for which both hold the same scene; None if there is none."""
+        """A seed for which both data sets hold the same scene; None if there is none."""
         shared = set(self.seeds) & set(other.seeds)
         same = all(_alike(self.origin.get(key), other.origin.get(key)) for key in _TABLE)
         return min(shared) if shared and same else None
 
 
 def _alike(one: Any, other: Any) -> bool:
-    """Whether two values of a scenario field allow the same scenes. Fields that one of them lacks,
-    as older files do, are ignored."""
+    """Whether two values of a scenario field can give the same scenes. Nested fields that only one
+    of them has are ignored, because older files lack some."""
     if not isinstance(one, Mapping) or not isinstance(other, Mapping):
         return bool(one == other)
     both = (one.keys() & other.keys()) - {*_NO_SCENE}
@@ -171,7 +173,7 @@ def _alike(one: Any, other: Any) -> bool:
 
 
 def evenly_chosen(items: list[Item], most: int | None) -> list[Item]:
-    """At most `most` items, chosen evenly; None for all."""
+    """Chooses at most `most` items, evenly spaced; all of them if it is None."""
     count = len(items) if most is None else min(len(items), most)
     return [items[i * len(items) // count] for i in range(count)]
 
@@ -192,7 +194,7 @@ def read_training_data(path: Path) -> TrainingData:
             scenario=STATIC,
             origin={"task": STATIC},
             grid=content.grid,
-            # Parts may be symmetric.
+            # Scenes may show symmetric parts, so `many_answers` is set.
             learning=Learning(
                 later_picks_possible=True, curvature=True, reflection=True, many_answers=True
             ),
@@ -204,7 +206,8 @@ def read_training_data(path: Path) -> TrainingData:
     else:
         demonstrations: Demonstrations = read_demonstrations(path)
         origin = demonstrations.origin
-        # A scenario's grid may start below the table; a bench's starts at the table.
+        # The lowest height of a simulated scenario's grid may be below the table. In recordings
+        # from a real robot it is the table.
         z_min = (origin.scenario.get("heightmap") or {}).get("z_min", 0.0)
         if z_min != 0:
             raise UserError(
@@ -225,5 +228,5 @@ def read_training_data(path: Path) -> TrainingData:
             },
         )
     if not data.count:
-        raise UserError(f"{path} holds no {data.kind}: {data.verb} some")
+        raise UserError(f"{path} holds no {data.kind}: {data.verb} some first")
     return data

@@ -26,7 +26,14 @@ class PlainLayer(nn.Module):
         self.bias = nn.Parameter(torch.zeros(channels))
 
     def forward(self, features: Tensor) -> Tensor:
-        """(batch, channels in, rows, cols) to (batch, channels, rows / stride, cols / stride)."""
+        """Convolves a map.
+
+        Args:
+            features: the map, of shape (batch, channels in, rows, cols).
+
+        Returns:
+            A map of shape (batch, channels, rows / stride, cols / stride).
+        """
         weight = self.weight.to(features.dtype, memory_format=torch.channels_last)
         bias = self.bias.to(features.dtype)
         return F.conv2d(features, weight, bias, stride=self.stride, padding=self.padding)
@@ -66,7 +73,7 @@ class Bottleneck(nn.Module):
         )
 
     def forward(self, features: Tensor, result_type: torch.dtype | None = None) -> Tensor:
-        """(batch, channels in, rows, cols) to (batch, channels, rows / stride, cols / stride).
+        """Maps (batch, channels in, rows, cols) to (batch, channels, rows / stride, cols / stride).
 
         Args:
             features: the input.
@@ -99,7 +106,7 @@ class ResNet(MixedPrecision):
         self.out = Bottleneck(top, top, out_channels, gain=0.1)
 
     def forward(self, image: Tensor) -> Tensor:
-        """(batch, in channels, rows, cols) to (batch, out channels, rows, cols) in float32.
+        """Maps (batch, in channels, rows, cols) to (batch, out channels, rows, cols) in float32.
 
         Computes in the type of the image. Its sides must be one more than a multiple of 8.
         """

@@ -100,7 +100,7 @@ class UNet(MixedPrecision):
         self.out = convolution(size.head, Scalar(), out_channels, Scalar(), 1, bias=True, gain=0.1)
 
     def forward(self, image: Tensor) -> Tensor:
-        """(batch, in channels, rows, cols) to (batch, out channels, rows, cols) in float32.
+        """Maps (batch, in channels, rows, cols) to (batch, out channels, rows, cols) in float32.
 
         Computes in the type of the image. Its sides must be one more than a multiple of 16.
 

@@ -34,7 +34,8 @@ _HEAP_RADIUS = 0.05
 _HEAP_REACH = 0.12
 """A heap needs a free disc of this radius, in metres."""
 _HEAP_HEIGHT, _HEAP_STEP = 0.12, 0.03
-"""The lowest tool of a heap falls from this height, each other from a step higher, in metres."""
+"""The lowest tool of a heap falls from the first height, in metres. Each further tool falls from
+higher by the second number."""
 _HEAP_TILT = math.radians(15.0)
 """Largest roll and pitch of the tools of a heap before they fall, in radians."""
 

@@ -97,7 +97,7 @@ class ExpandedConv2d(nn.Module):
         return None if self.bias is None else self.bias.repeat_interleave(self.out_fibre.channels)
 
     def forward(self, features: Tensor) -> Tensor:
-        """(batch, in channels, rows, cols) to (batch, out channels, rows, cols)."""
+        """Maps (batch, in channels, rows, cols) to (batch, out channels, rows, cols)."""
         bias = self.channel_bias()
         return F.conv2d(
             features,
@@ -183,7 +183,7 @@ class PlainConv2d(nn.Conv2d):
         )
 
     def forward(self, features: Tensor) -> Tensor:
-        """(batch, in channels, rows, cols) to (batch, out channels, rows, cols)."""
+        """Maps (batch, in channels, rows, cols) to (batch, out channels, rows, cols)."""
         weight = self.weight.to(features.dtype)
         bias = None if self.bias is None else self.bias.to(features.dtype)
         return F.conv2d(features, weight, bias, padding=self.padding)
