@@ -292,6 +292,9 @@ class ArmMotion(JawMotion):
         # Do not turn joint 7 back: it would take longer than the other joints.
         way.over[6] = now[6]
 
+    def slow_down(self, state: PlannerState, time: float, share: float) -> None:
+        """Does nothing: the limits of the joints rule. See `RobotMotion`."""
+
     def back_off(self, state: PlannerState, distance: float) -> None:
         """Raises the goal of the present mode. See `RobotMotion`."""
         assert isinstance(state, ArmState)

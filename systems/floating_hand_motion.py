@@ -1,5 +1,7 @@
 """The floating hand's motion in each mode of the pick-and-place motion primitive."""
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -28,6 +30,8 @@ TRIAL = 0.010
 _OVERSHOOT = 0.05
 """How far above the travel height the goal of a lift is, in m, so that the hand passes that height
 without a stop."""
+_HOLDING = (Mode.LIFT, Mode.CARRY, Mode.LOWER, Mode.SEARCH)
+"""The modes in which an object is in the hand."""
 
 
 class HandMotion(JawMotion):
@@ -80,12 +84,18 @@ class HandMotion(JawMotion):
             now, rate = np.array(at), np.zeros(4)
         self.begin_jaws(state, mode, time, opening)
         state.mode = mode
+        self._begin_at(state, time, now, rate)
+
+    def _begin_at(
+        self, state: PlannerState, time: float, now: NDArray[np.float64], rate: NDArray[np.float64]
+    ) -> None:
+        """Starts the motion of the present mode from a position (4) and a velocity (4)."""
         state.start_time = time
         state.start = now
         state.start_rate = rate
         # The default goal is where the hand comes to rest if it brakes.
         state.goal = now + rate * braking_time(rate, self._limits_of(state)) / 2
-        self._set_goals(state, mode)
+        self._set_goals(state, Mode(int(state.mode)))
         self.set_times(state)
 
     def _set_goals(self, state: PlannerState, mode: Mode) -> None:
@@ -152,7 +162,7 @@ class HandMotion(JawMotion):
         for mark in (first, expected, float(state.goal[Z])):
             marks.append(max(min(mark, marks[-1]), float(state.goal[Z])))
         ways = np.diff(marks).tolist()
-        legs = blended_legs(ways, self._leg_speeds(mode), self._limits[mode].acceleration)
+        legs = blended_legs(ways, self._leg_speeds(mode), self._limits_of(state).acceleration)
         for index, leg in enumerate(legs):
             state.leg_ways[index], state.leg_delays[index] = leg.way, leg.delay
 
@@ -172,7 +182,23 @@ class HandMotion(JawMotion):
 
     def _limits_of(self, state: PlannerState) -> MotionLimits:
         """The limits of the present mode's motion."""
-        return self._limits[Mode(int(state.mode))]
+        mode = Mode(int(state.mode))
+        limits, share = self._limits[mode], float(state.gentleness)
+        if not share or mode not in _HOLDING:
+            return limits
+        return replace(
+            limits,
+            acceleration=share * limits.acceleration,
+            yaw_acceleration=share * limits.yaw_acceleration,
+        )
+
+    def slow_down(self, state: PlannerState, time: float, share: float) -> None:
+        """Goes on with less acceleration. See `RobotMotion`."""
+        now, rate, _ = np.split(self.motion_at(state, time), 3)
+        opening, _ = self.opening_at(state, time)
+        state.start_opening = state.goal_opening = opening
+        state.gentleness = share
+        self._begin_at(state, time, now, rate)
 
     def back_off(self, state: PlannerState, distance: float) -> None:
         """Raises the goal of the present mode. See `RobotMotion`."""
@@ -207,4 +233,4 @@ class HandMotion(JawMotion):
     def brakes_above(self, state: PlannerState, time: float, height: float) -> bool:
         """Whether the hand would stop above a height if it began to brake now."""
         now, rate, _ = np.split(self.motion_at(state, time), 3)
-        return bool(now[2] + rate[2] * braking_time(rate, self._limits[Mode.LIFT]) / 2 >= height)
+        return bool(now[2] + rate[2] * braking_time(rate, self._limits_of(state)) / 2 >= height)

@@ -1,4 +1,4 @@
-"""The force of the pads, chosen by the weight that the hand feels."""
+"""The force of the pads, chosen by the weight and the moment that the hand feels."""
 
 import numpy as np
 
@@ -12,10 +12,26 @@ _TOO_EARLY = 1.5
 """
 _EASY_MOMENT = 0.18
 """A moment about the axis of the pads that friction holds easily, in N m."""
+_MOMENT_ARM = 0.0030
+"""The pads hold a moment of their force times this length, in m, while the hand accelerates. A long
+round handle begins to turn at 5 mm."""
+_HELD_MOMENT = 0.30
+"""A moment that a firm grip holds on the way if it holds it at rest, in N m."""
+_NOTABLE_MOMENT = 0.08
+"""A moment that a poor grip might not hold, in N m."""
 _INDULGENCE = 0.5
 """Each time an object was set down again, the allowed moment grows by this share."""
 _LONGEST_LEVER = 0.12
 """Largest plausible distance of a centre of mass from the pads' middle, in m."""
+_SOFT, _SOFT_SHARE = 0.006, 0.2
+"""If the jaws sink farther into an object than this, in m, or than this share of its width, they
+press less."""
+_MUCH_LESS = 0.85
+"""The force on an object into which the jaws sink falls only in steps of at least this factor."""
+_GENTLE, _GENTLEST = 0.5, 0.25
+"""Shares of the acceleration limits for an object that may turn, and the least of all."""
+_GENTLER = 0.8
+"""A motion is restarted when its acceleration should be less than this share of the present one."""
 _LEAST_CHANGE = 1.05
 """The force rises only in steps of at least this factor, so that noise does not restart its
 ramp."""
@@ -32,18 +48,22 @@ def felt_weight(contact_force: float, acceleration: float) -> float:
     return -contact_force / max(1 + acceleration / GRAVITY, 0.1)
 
 
-def grip_force(weight: float, present: float, parameters: PickPlaceParameters) -> float:
+def grip_force(
+    weight: float, present: float, parameters: PickPlaceParameters, moment: float = 0.0
+) -> float:
     """The force of each pad on an object of a given weight, in N.
 
     It is proportional to the weight up to `firm_grasp_force` at `heavy_load`, but at least
     `grasp_force`. Beyond `heavy_load` it rises linearly to `peak_grasp_force` at `heaviest_load`.
-    The force never falls while the object is held: with less force, an object that has begun to
-    turn between the pads would turn further.
+    A moment about the axis of the pads may require more, up to the peak. The force never falls
+    while the object is held: with less force, an object that has begun to turn between the pads
+    would turn further.
 
     Args:
         weight: the weight that the hand feels, in N.
         present: the present force of each pad, in N.
         parameters: the forces and loads.
+        moment: about the axis of the pads while the hand rests, in N m.
     """
     heavy, heaviest = parameters.heavy_load, max(parameters.heaviest_load, parameters.heavy_load)
     firm = max(parameters.firm_grasp_force, parameters.grasp_force)
@@ -55,7 +75,52 @@ def grip_force(weight: float, present: float, parameters: PickPlaceParameters) -
             [parameters.grasp_force, firm, peak],
         )
     )
+    force = max(force, min(abs(moment) / _MOMENT_ARM, peak))
     return force if force > _LEAST_CHANGE * present or force == peak > present else present
+
+
+def soft_force(
+    force: float, sunk: float, width: float, present: float, parameters: PickPlaceParameters
+) -> float:
+    """The force of the pads on an object that gives way, in N.
+
+    Pads that go through a thin wall would neither hold it well nor let it go again.
+
+    Args:
+        force: of `grip_force`, in N.
+        sunk: how far the jaws have closed since they gripped, in m.
+        width: of the object when they gripped, in m.
+        present: the present force, in N.
+        parameters: the least and the largest force.
+    """
+    peak = max(parameters.peak_grasp_force, parameters.grasp_force)
+    soft = min(_SOFT, _SOFT_SHARE * width)
+    most = max(peak * (soft / max(sunk, soft)) ** 2, parameters.grasp_force)
+    if most > _MUCH_LESS * present:
+        # Keep it, so that its ramp is not restarted.
+        most = max(most, present)
+    return min(force, most)
+
+
+def gentleness(
+    weight: float, moment: float, present: float, parameters: PickPlaceParameters
+) -> float:
+    """The share of the acceleration limits with which an object of a given weight is moved.
+
+    It is inversely proportional to the weight above `heavy_load`, and at most a half if the object
+    may turn between the pads. It never rises while the object is held.
+
+    Args:
+        weight: what the hand feels, in N.
+        moment: about the axis of the pads while the hand rests, in N m.
+        present: the present share; 0 counts as 1.
+        parameters: the load.
+    """
+    present = present or 1.0
+    share = max(parameters.heavy_load / max(weight, parameters.heavy_load), _GENTLEST)
+    if may_turn(moment):
+        share = min(share, _GENTLE)
+    return share if share < _GENTLER * present else present
 
 
 def moment_at_rest(moment: float, acceleration: float) -> float:
@@ -85,8 +150,17 @@ def felt_lever(moment: float, weight: float) -> float:
     return min(max(moment / max(weight, 1e-3), -_LONGEST_LEVER), _LONGEST_LEVER)
 
 
+def may_turn(moment: float) -> bool:
+    """Whether a poor grip may let an object turn between the pads.
+
+    Args:
+        moment: about the axis of the pads while the hand rests, in N m.
+    """
+    return abs(moment) > _NOTABLE_MOMENT
+
+
 def turns_in_the_pads(moment: float, times: float) -> bool:
-    """Whether an object turns between the pads, or is about to.
+    """Whether an object may turn between the pads, so that it must be seen how it hangs.
 
     Args:
         moment: moment about the axis of the pads while the hand rests, in N m.
@@ -94,6 +168,14 @@ def turns_in_the_pads(moment: float, times: float) -> bool:
             allowed, so that the attempts end.
     """
     return abs(moment) > _EASY_MOMENT * (1 + _INDULGENCE * times)
+
+
+def slips_when_carried(moment: float, times: float) -> bool:
+    """Whether an object that hangs still may turn between the pads on the way.
+
+    The arguments are those of `turns_in_the_pads`.
+    """
+    return abs(moment) > _HELD_MOMENT * (1 + _INDULGENCE * times)
 
 
 def lifts_too_early(wanted: float, present: float) -> bool:

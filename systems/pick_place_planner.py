@@ -107,11 +107,15 @@ class PickPlacePlanner(LeafSystem):
     - `CHECK`: a grasp is good if the pads are further apart than `minimum_width` and both feel at
       least half of the grasp force. If the grasp is not good, or is lost later, the hand retreats
       and observes again. The attempt counts as an action.
-    - `LIFT`, `CARRY`: the more the object weighs, the more firmly it is gripped (`grip_force`). A
-      heavy object is lifted only once the grip is firm.
-    - `LIFT`: if the moment of the object's weight about the axis of the pads is more than friction
-      holds (`turns_in_the_pads`), the object is set down again. The history then contains the
-      estimated centre of mass, so that a policy can grip the object there.
+    - `LIFT`, `CARRY`: the more the object weighs, and the larger the moment of its weight about the
+      axis of the pads, the more firmly it is gripped (`grip_force`), but less firmly if the jaws
+      sink in (`soft_force`). A heavy object is lifted only once the grip is firm. A floating hand
+      moves it with less acceleration (`gentleness`).
+    - `LIFT`: if the object is heavy or that moment is notable, the hand lifts it by 1 cm first, and
+      rests. If the object turns between the pads, or the moment is more than
+      friction holds on the way (`slips_when_carried`), it is set down again. The history then
+      contains the estimated centre of mass, so that a policy can grip the object there.
+    - `RELEASE`: if the jaws stick to the object, they open with force.
     - `SEARCH`: in tasks that insert objects into cavities, if the object stands on the rim around
       its place, the hand searches for the cavity. When the resistance ends, it lowers the object
       further.
@@ -274,7 +278,7 @@ class PickPlacePlanner(LeafSystem):
             context.get_time(),
             self._hand_state.Eval(context),
             self._contact_force.Eval(context),
-            float(self._wrist_moment.Eval(context)[0]) if feels else 0.0,
+            float(self._wrist_moment.Eval(context)[0]) if feels else None,
         )
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:

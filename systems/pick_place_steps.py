@@ -11,9 +11,13 @@ from systems.contact_guard import ContactGuard
 from systems.grip_force import (
     felt_lever,
     felt_weight,
+    gentleness,
     grip_force,
     lifts_too_early,
+    may_turn,
     moment_at_rest,
+    slips_when_carried,
+    soft_force,
     turns_in_the_pads,
 )
 from systems.pick_place_parameters import Mode, PickPlaceParameters
@@ -25,6 +29,10 @@ _HOLDING = (Mode.LIFT, Mode.CARRY, Mode.LOWER, Mode.SEARCH, Mode.RELEASE)
 _STEADY = 0.6
 """If an object's moment about the pads falls below this share of its earlier value, it has
 turned."""
+_STUCK = 0.004
+"""If the jaws have opened by this much less than commanded, they stick to the object, in m."""
+_LONGEST_RELEASE = 1.0
+"""After this time the hand rises even if the jaws stick, in s."""
 _RISEN = 0.0005
 """The hand counts as lifted when it is this far above its height at the grip, in m."""
 
@@ -40,8 +48,9 @@ class Moment:
     """(12) value of the planner's port `hand_state`."""
     contact: NDArray[np.float64]
     """(6) value of the planner's port `hand_contact_force`."""
-    wrist_moment: float = 0.0
-    """Value of the planner's port `wrist_moment`, in N m; zero if it is not connected."""
+    wrist_moment: float | None = None
+    """Value of the planner's port `wrist_moment`, in N m; None if it is not connected, or in
+    another mode than `LIFT`."""
 
 
 class PickPlaceSteps:
@@ -72,6 +81,7 @@ class PickPlaceSteps:
             Mode.CARRY: self.hold,
             Mode.LOWER: self.lower,
             Mode.SEARCH: self.search,
+            Mode.RELEASE: self.release,
         }
 
     def step(self, moment: Moment) -> None:
@@ -150,7 +160,8 @@ class PickPlaceSteps:
         if time < self._motion.arrival(state) + self._settle:
             return
         if self._is_held(hand, contact):
-            state.hold_z = hand[2]
+            state.hold_z, state.held_width = hand[2], hand[4] + hand[5]
+            state.gentleness = state.trusts_grip = 0
             # If the object is gripped higher than planned, it hangs lower below the fingertips.
             higher = max(hand[2] - state.grasp_z, 0.0)
             state.travel_z += higher
@@ -166,22 +177,33 @@ class PickPlaceSteps:
         desired = self._motion.motion_at(state, time)
         acceleration = float(self._motion.hand_acceleration(state, time, desired)[Z])
         weight = felt_weight(moment.contact[2], acceleration)
-        turning = moment.wrist_moment
+        turning = moment.wrist_moment or 0.0
+        at_rest = moment_at_rest(turning, acceleration)
+        share = gentleness(weight, at_rest, float(state.gentleness), self._parameters)
+        if share < (state.gentleness or 1.0):
+            self._motion.slow_down(state, time, share)
         if state.doubts_grip:
+            self._grip(moment, weight, at_rest)
             lever = felt_lever(turning, weight)
-            if acceleration <= 0 and abs(lever) > abs(state.lever):
-                state.lever = lever
+            if acceleration <= 0 and weight > state.trial_weight:
+                state.lever, state.trial_weight = lever, weight
             if time >= self._motion.arrival(state) + self._parameters.tare_settle:
                 self._end_trial(moment, lever, weight)
-        elif moment.hand[2] > state.hold_z + _RISEN and turns_in_the_pads(
-            moment_at_rest(turning, acceleration), float(state.set_downs)
-        ):
-            state.doubts_grip, state.lever = 1, 0.0
-            force = grip_force(weight, float(state.goal_force), self._parameters)
-            self._motion.set_force(state, time, force)
+        elif moment.hand[2] > state.hold_z + _RISEN and self._doubts_grip(moment, weight, at_rest):
+            state.doubts_grip, state.lever, state.trial_weight = 1, 0.0, 0.0
+            self._grip(moment, weight, at_rest)
             self._motion.begin(state, Mode.LIFT, time)
         else:
             self.hold(moment)
+
+    def _doubts_grip(self, moment: Moment, weight: float, turning: float) -> bool:
+        """Whether to see first how the object hangs."""
+        state = moment.state
+        if moment.wrist_moment is None or state.trusts_grip:
+            return False
+        is_heavy = weight > self._parameters.heavy_load
+        turns = turns_in_the_pads(turning, float(state.set_downs))
+        return is_heavy or turns or may_turn(turning)
 
     def _end_trial(self, moment: Moment, lever: float, weight: float) -> None:
         """Ends a trial lift: continues to lift if the object has not turned, else sets it down.
@@ -193,16 +215,18 @@ class PickPlaceSteps:
         """
         state = moment.state
         # An object that has turned until it leans on the table exerts less moment on the pads.
-        has_turned = abs(lever) < _STEADY * abs(state.lever)
-        lever = float(state.lever) if has_turned else lever
+        before = float(state.lever)
+        has_turned = lever * before < _STEADY * before**2
+        if has_turned:
+            lever, weight = before, float(state.trial_weight)
         # The allowed moment grows with the number of earlier attempts, but not for an object that
         # has turned.
-        times = 0.0 if has_turned else float(state.set_downs)
-        if turns_in_the_pads(lever * weight, times):
+        turning, times = lever * weight, float(state.set_downs)
+        if may_turn(turning) if has_turned else slips_when_carried(turning, times):
             state.lever = lever
             self._set_down(moment)
         else:
-            state.doubts_grip = 0
+            state.doubts_grip, state.trusts_grip = 0, 1
             self._motion.begin(state, Mode.LIFT, moment.time)
 
     def _set_down(self, moment: Moment) -> None:
@@ -220,8 +244,9 @@ class PickPlaceSteps:
         desired = self._motion.motion_at(state, time)
         acceleration = self._motion.hand_acceleration(state, time, desired)
         weight = felt_weight(contact[2], acceleration[Z])
-        force = grip_force(weight, float(state.goal_force), self._parameters)
-        self._motion.set_force(state, time, force)
+        force = self._grip(
+            moment, weight, moment_at_rest(moment.wrist_moment or 0.0, acceleration[Z])
+        )
         if state.mode == Mode.LIFT and lifts_too_early(force, self._motion.force_at(state, time)):
             # Brake, and continue when the grip is firm.
             self._motion.begin(state, Mode.LIFT, time)
@@ -234,6 +259,25 @@ class PickPlaceSteps:
         elif time >= self._motion.arrival(state) + self._settle:
             self._guard.tare(state, contact, self._parameters.contact_threshold)
             self._motion.begin(state, Mode.LOWER, time)
+
+    def _grip(self, moment: Moment, weight: float, turning: float) -> float:
+        """Grips as firmly as an object needs.
+
+        Args:
+            moment: the inputs.
+            weight: what the hand feels, in N.
+            turning: the moment about the axis of the pads while the hand rests, in N m.
+
+        Returns:
+            The force of each pad in the end, in N.
+        """
+        state, hand, parameters = moment.state, moment.hand, self._parameters
+        present = float(state.goal_force)
+        force = grip_force(weight, present, parameters, turning)
+        width = float(state.held_width)
+        force = soft_force(force, width - hand[4] - hand[5], width, present, parameters)
+        self._motion.set_force(state, moment.time, force)
+        return force
 
     def lower(self, moment: Moment) -> None:
         """Lowers the object until contact. Begins the search if it then stands on a rim."""
@@ -266,6 +310,15 @@ class PickPlaceSteps:
                 self._motion.begin(state, Mode.SEARCH, time)
             else:
                 self._motion.begin(state, Mode.RELEASE, time, z=hand[2])
+
+    def release(self, moment: Moment) -> None:
+        """Opens the jaws, with force if they stick, and goes on when they have opened."""
+        state, time, hand = moment.state, moment.time, moment.hand
+        sticks = hand[4] + hand[5] < state.goal_opening - _STUCK
+        if sticks and self._motion.arrival(state) <= time < state.start_time + _LONGEST_RELEASE:
+            self._motion.set_force(state, time, -self._parameters.grasp_force)
+        else:
+            self.follow(moment)
 
     def _is_blocked(self, state: PlannerState, hand: NDArray[np.float64]) -> bool:
         bottom = hand[2] - state.hold_z + state.support_z

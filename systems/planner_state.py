@@ -55,6 +55,10 @@ class PlannerState(VectorView):
     """Height of the fingertips when the jaws had gripped the object. `touch_z` is the height at
     which the object touched a cavity's rim."""
     touch_z = Number()
+    held_width = Number()
+    """The opening of the jaws when they had gripped, in m."""
+    gentleness = Number()
+    """The share of the acceleration limits with which the held object is moved; 0: all of it."""
     search_step = Number()
     payload = Number()
     """The vertical force of the payload on the hand, in N; negative or zero."""
@@ -86,8 +90,12 @@ class PlannerState(VectorView):
     lever = Number()
     """Position of the object's centre of mass relative to the pads' middle, along the pads, in m,
     if the object is set down again."""
+    trial_weight = Number()
+    """The largest weight felt in the trial lift, when the table bore least of it, in N."""
     doubts_grip = Number()
     """1 during a trial lift of an object that may turn between the pads, else 0."""
+    trusts_grip = Number()
+    """1 if the object hung still in its trial lift, else 0."""
     set_downs = Number()
     """Number of earlier actions that set this object down again."""
     free_actions = Number()

@@ -65,6 +65,15 @@ class RobotMotion(Protocol):
     def back_off(self, state: PlannerState, distance: float) -> None:
         """Raises the goal of the present mode, a straight line of the hand, by a distance."""
 
+    def slow_down(self, state: PlannerState, time: float, share: float) -> None:
+        """Goes on with the present mode, and carries the object, with less acceleration.
+
+        Args:
+            state: the planner's state; modified.
+            time: the present time.
+            share: of the acceleration limits.
+        """
+
     def motion_at(self, state: PlannerState, time: float) -> NDArray[np.float64]:
         """(size) desired positions, velocities and accelerations of the robot's joints at a
         time."""

@@ -53,6 +53,7 @@ class World:
         stiffness: of the surfaces, in N/m.
         width: of the object between the pads in m, by attempt (from 1) and mode.
         levers: how far the object hangs from the pads along them in m, by attempt, else zero.
+        sticks: whether the jaws open only with force.
     """
 
     touch_pick: float = NO_TOUCH
@@ -61,6 +62,7 @@ class World:
     stiffness: float = 1e5
     width: Callable[[int, Mode], float] = lambda attempt, mode: WIDTH
     levers: tuple[float, ...] = ()
+    sticks: bool = False
 
 
 @dataclasses.dataclass
@@ -107,7 +109,10 @@ class PerfectHand(LeafSystem):
     def _calc_state(self, context, output) -> None:
         q, v, _ = np.split(self._eval(context, "desired_motion"), 3)
         opening, rate = self._eval(context, "desired_opening")
-        if opening < self._width(context):
+        releases = self._eval(context, "mode")[0] == Mode.RELEASE
+        is_pushed_open = self._eval(context, "closing_force")[0] < -20
+        sticks = self._world.sticks and releases and not is_pushed_open
+        if opening < self._width(context) or sticks:
             opening, rate = self._width(context), 0.0
         fingers, rates = [opening / 2] * 2, [rate / 2] * 2
         output.SetFromVector(np.concatenate([q, fingers, v, rates]))
@@ -324,9 +329,29 @@ def test_an_object_that_would_turn_is_set_down_where_it_was_and_its_balance_is_t
     assert run.counts == [2, 0, 0]
 
 
-def test_an_object_that_hangs_near_the_pads_is_carried_at_once():
-    run = Run(World(levers=(0.02,), touch_place=0.0)).finish()
-    assert [item.outcome for item in run.output("history")] == ["placed"]
+def resting_heights(run: Run) -> NDArray:
+    """The heights at which the hand has rested, in m."""
+    motion = run.log.FindLog(run.simulator.get_context()).data()
+    return motion[2, np.abs(motion[4:8]).max(axis=0) == 0.0]
+
+
+@pytest.mark.parametrize(("lever", "is_tried"), [(0.005, False), (0.02, True)])
+def test_the_hand_sees_first_how_a_long_object_hangs(lever: float, is_tried: bool):
+    parameters = dataclasses.replace(PARAMETERS, heavy_load=8 * WEIGHT)
+    world = World(levers=(lever,), touch_place=0.0)
+    run = Run(world, parameters=parameters).until(Mode.CARRY)
+    rested = resting_heights(run) - GRASP_Z
+    assert ((rested > 0.008) & (rested < 0.015)).any() == is_tried
+    assert [item.outcome for item in run.finish().output("history")] == ["placed"]
+
+
+def test_jaws_that_stick_to_the_object_are_opened_with_force():
+    run = Run(World(sticks=True)).until(Mode.RETREAT)
+    assert run.modes[-1][0] - run.modes[-2][0] < 0.5
+    opened = WIDTH + 2 * PARAMETERS.release_clearance
+    assert run.output("desired_opening")[0] == pytest.approx(opened, abs=1e-3)
+    run.finish()
+    assert run.sequence == [*PICK_AND_PLACE, Mode.OBSERVE, Mode.DONE]
 
 
 @pytest.mark.parametrize("height", [0.02, 0.045])
