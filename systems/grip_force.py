@@ -17,7 +17,7 @@ _MOMENT_ARM = 0.0030
 round handle begins to turn at 5 mm."""
 _HELD_MOMENT = 0.30
 """A moment that a firm grip holds on the way if it holds it at rest, in N m."""
-_NOTABLE_MOMENT = 0.08
+_NOTABLE_MOMENT = 0.10
 """A moment that a poor grip might not hold, in N m."""
 _INDULGENCE = 0.5
 """Each time an object was set down again, the allowed moment grows by this share."""

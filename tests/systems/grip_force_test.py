@@ -70,7 +70,7 @@ def test_jaws_that_sink_in_press_less_but_do_not_follow_every_millimetre():
 
 def test_the_heavier_the_gentler_and_never_faster_again():
     assert gentleness(4.0, 0.0, 0.0, PARAMETERS) == 1.0
-    assert gentleness(4.0, -0.1, 0.0, PARAMETERS) == 0.5
+    assert gentleness(4.0, -0.12, 0.0, PARAMETERS) == 0.5
     assert gentleness(10.0, 0.0, 0.0, PARAMETERS) == pytest.approx(0.5)
     assert gentleness(6.0, 0.0, 0.5, PARAMETERS) == 0.5
     assert gentleness(100.0, 0.0, 0.5, PARAMETERS) == 0.25
