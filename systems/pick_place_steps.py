@@ -314,11 +314,14 @@ class PickPlaceSteps:
     def release(self, moment: Moment) -> None:
         """Opens the jaws, with force if they stick, and goes on when they have opened."""
         state, time, hand = moment.state, moment.time, moment.hand
-        sticks = hand[4] + hand[5] < state.goal_opening - _STUCK
-        if sticks and self._motion.arrival(state) <= time < state.start_time + _LONGEST_RELEASE:
+        opening = hand[4] + hand[5]
+        if opening >= state.goal_opening - _STUCK or time < self._motion.arrival(state):
+            self.follow(moment)
+        elif time < state.start_time + _LONGEST_RELEASE:
             self._motion.set_force(state, time, -self._parameters.grasp_force)
         else:
-            self.follow(moment)
+            # The fingers may be jammed in a cavity: do not press against its walls on the way up.
+            self._motion.begin(state, Mode.RETREAT, time, opening=opening)
 
     def _is_blocked(self, state: PlannerState, hand: NDArray[np.float64]) -> bool:
         bottom = hand[2] - state.hold_z + state.support_z
