@@ -31,6 +31,8 @@ _STEADY = 0.6
 turned."""
 _STUCK = 0.004
 """If the jaws have opened by this much less than commanded, they stick to the object, in m."""
+_PUSH = 1 / 3
+"""Then they open with this share of the grasp force, besides that of their springs."""
 _LONGEST_RELEASE = 1.0
 """After this time the hand rises even if the jaws stick, in s."""
 _RISEN = 0.0005
@@ -318,7 +320,7 @@ class PickPlaceSteps:
         if opening >= state.goal_opening - _STUCK or time < self._motion.arrival(state):
             self.follow(moment)
         elif time < state.start_time + _LONGEST_RELEASE:
-            self._motion.set_force(state, time, -self._parameters.grasp_force)
+            self._motion.set_force(state, time, -_PUSH * self._parameters.grasp_force)
         else:
             # The fingers may be jammed in a cavity: do not press against its walls on the way up.
             self._motion.begin(state, Mode.RETREAT, time, opening=opening)

@@ -110,7 +110,7 @@ class PerfectHand(LeafSystem):
         q, v, _ = np.split(self._eval(context, "desired_motion"), 3)
         opening, rate = self._eval(context, "desired_opening")
         releases = self._eval(context, "mode")[0] == Mode.RELEASE
-        is_pushed_open = self._eval(context, "closing_force")[0] < -20
+        is_pushed_open = self._eval(context, "closing_force")[0] < -5
         sticks = self._world.sticks and releases and not is_pushed_open
         if opening < self._width(context) or sticks:
             opening, rate = self._width(context), 0.0
