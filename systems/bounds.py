@@ -43,6 +43,10 @@ def check_bounds(config: Any, where: str = "") -> None:
 
 
 def _check_field(value: Any, metadata: Any, path: str) -> None:
+    if isinstance(value, dict):
+        for key, item in value.items():
+            _check_field(item, metadata, f"{path}.{key}")
+        return
     values = value if isinstance(value, list) else [value]
     length = metadata.get("length", len(values))
     if len(values) != length:

@@ -4,7 +4,7 @@ import base64
 import html
 import json
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -119,11 +119,13 @@ def prove_kit(folder: Path, episodes: int, progress: Progress) -> str:
     """
     record = json.loads((folder / "kit.json").read_text())
     own = 1e3 * float(record["kit_parameters_m"]["clearance"])
-    proof = _prove(folder, own, episodes, progress)
+    fits = dict(record["kit_parameters_m"].get("clearance_of", {}))
+    proof = _prove(folder, own, episodes, progress, fits)
     wider: list[KitProof] = []
     for factor in () if proof.fits else _WIDER:
         clearance = round(max(factor * own, own + _LEAST_WIDER_MM * (len(wider) + 1)), 2)
-        wider.append(_prove(folder, clearance, episodes, progress))
+        more = {name: value + 1e-3 * (clearance - own) for name, value in fits.items()}
+        wider.append(_prove(folder, clearance, episodes, progress, more))
         if wider[-1].fits:
             break
     verdict = _verdict(proof, wider)
@@ -150,13 +152,25 @@ def prove_kit(folder: Path, episodes: int, progress: Progress) -> str:
     return verdict
 
 
-def _prove(folder: Path, clearance_mm: float, episodes: int, progress: Progress) -> KitProof:
+def _prove(
+    folder: Path,
+    clearance_mm: float,
+    episodes: int,
+    progress: Progress,
+    clearance_of: Mapping[str, float],
+) -> KitProof:
     proof = KitProof(clearance_mm)
     for seed in range(episodes):
         progress(f"clearance {clearance_mm:g} mm", seed, episodes)
         error = float(np.random.default_rng([seed, 23]).normal(0.0, TOLERANCE_MM))
-        drawn = max(1e-3 * (clearance_mm + error), 0.0)
-        text = f"task: {{kit: {{clearance: {drawn:.6f}}}}}"
+        drawn = {
+            name: round(max(value + 1e-3 * error, 0.0), 6)
+            for name, value in {"": 1e-3 * clearance_mm, **clearance_of}.items()
+        }
+        kit: dict[str, Any] = {"clearance": drawn.pop("")}
+        if drawn:
+            kit["clearance_of"] = drawn
+        text = json.dumps({"task": {"kit": kit}})
         chosen = find_scenario(folder / "scenario.yaml", None, text, None)
         diagram, station = build_chosen(chosen, seed=seed)
         pictured = seed == 0

@@ -15,6 +15,7 @@ from rich.table import Table
 from kitting_drake.common.command_line import count_type, run_command
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import MODELS
+from kitting_drake.hkd.fabrication.kit_request import describe_kit, request_of
 from kitting_drake.hkd.generation.catalogue import ToolEntry, load_catalogue
 from kitting_drake.hkd.generation.generate import generate_tool
 from kitting_drake.hkd.generation.part_models import load_named
@@ -128,32 +129,28 @@ def trace(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
 
 def kit(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
     """Makes a kit of 1 to 12 tools: to print (STL, 3MF), to cut (DXF, SVG) and to simulate."""
-    from kitting_drake.hkd.fabrication.export import FITS, KitRequest, export_kit
+    # Drake is slow to import, and the other verbs do not need it.
+    from kitting_drake.hkd.fabrication.export import export_kit
 
-    request = KitRequest(
-        tools=tuple(args.tools),
-        output=args.output,
-        clearance_mm=args.clearance_mm if args.fit is None else FITS[args.fit],
-        compensate_mm=args.compensate_mm,
-        lead_in_mm=args.lead_in_mm,
-        wall_mm=args.wall_mm,
-        block_mm=tuple(args.block_mm) if args.block_mm else None,
-        notches=args.notches,
-        labels=args.labels,
-        robot="" if args.robot is None else _robot_text(args.robot),
-    )
+    request = request_of(args, "" if args.robot is None else _robot_text(args.robot))
     if args.prove:
         # Import Drake lazily, and early enough that a missing Drake is reported before any work.
         from kitting_drake.common.rendering import require_rendering
 
         require_rendering()
     with Console(stderr=True, quiet=args.quiet).status("making the kit"):
-        design = export_kit(request)
+        made = export_kit(request)
     console = Console(quiet=args.quiet, highlight=False, markup=False)
-    size = " x ".join(f"{side:g}" for side in design.size_mm)
+    size = " x ".join(f"{side:g}" for side in made.design.size_mm)
     files = "kit.stl, kit.3mf, cavities.dxf, cavities.svg, kit.png"
     console.print(f"a block of {size} mm in {args.output}/: {files}", soft_wrap=True)
-    for note in design.notes:
+    if made.split is not None:
+        console.print(f"  {len(made.split.pieces)} pieces: piece_1.stl and on, see pieces.png")
+    elif args.bed:
+        console.print("  the block fits the bed in one piece")
+    if made.sheet is not None:
+        console.print(f"  {len(made.sheet.places)} kits on the sheet: sheet.dxf, .svg and .png")
+    for note in made.notes:
         console.print(f"  {note}", soft_wrap=True)
     has_room = _check_scenario(args.output / "scenario.yaml", console)
     if args.prove and has_room:
@@ -292,7 +289,9 @@ def main() -> int:
     tracer = verbs.add_parser("trace", help=trace.__doc__)
     describe_trace(tracer)
     tracer.set_defaults(function=trace)
-    _describe_kit(verbs.add_parser("kit", help=kit.__doc__))
+    maker = verbs.add_parser("kit", help=kit.__doc__)
+    describe_kit(maker)
+    maker.set_defaults(function=kit)
     args = parser.parse_args()
     models = getattr(args, "models", MODELS)
     args.function(args, load_catalogue(models / "tools" / "catalogue.yaml"))
@@ -340,65 +339,6 @@ def _describe_import(importer: argparse.ArgumentParser) -> None:
     )
     importer.add_argument("--quiet", action="store_true", help="print nothing but errors")
     importer.set_defaults(function=import_mesh)
-
-
-def _describe_kit(maker: argparse.ArgumentParser) -> None:
-    maker.add_argument("tools", nargs="+", metavar="TOOL", help="names or folders of tools")
-    maker.add_argument(
-        "--output", type=Path, required=True, metavar="DIR", help="the folder to write"
-    )
-    room = maker.add_mutually_exclusive_group()
-    room.add_argument(
-        "--clearance_mm",
-        type=float,
-        help="the clearance between a tool and its cavity's wall (default: 2)",
-    )
-    room.add_argument(
-        "--fit",
-        choices=("snug", "easy", "loose"),
-        help="the clearance by name: 0.15, 0.35 or 0.75 mm on each side",
-    )
-    maker.add_argument(
-        "--compensate_mm",
-        type=float,
-        default=0.0,
-        help="how much too narrow your printer or router makes cavities, on each side. It is "
-        "half the difference between 20 mm and the printed hole of test_piece.stl (default: "
-        "0)",
-    )
-    maker.add_argument(
-        "--lead_in_mm", type=float, help="the width of the bevel around the rims (default: 1)"
-    )
-    maker.add_argument(
-        "--wall_mm", type=float, help="the wall between and around the cavities (default: 6)"
-    )
-    maker.add_argument(
-        "--block_mm",
-        type=float,
-        nargs=3,
-        metavar=("LENGTH", "WIDTH", "HEIGHT"),
-        help="the block's size (default: as small as possible, and 50 high)",
-    )
-    maker.add_argument(
-        "--prove",
-        type=count_type,
-        nargs="?",
-        const=10,
-        metavar="N",
-        help="simulate the kitting N times (10 if N is left out) with the errors of a printer, "
-        "and write proof.html",
-    )
-    maker.add_argument("--notches", action="store_true", help="add finger notches")
-    maker.add_argument(
-        "--robot",
-        type=Path,
-        metavar="ROBOT.yaml",
-        help="a file with the robot arm, as for `decide`; reports how often the arm reaches "
-        "everything",
-    )
-    maker.add_argument("--labels", action="store_true", help="engrave the tools' names")
-    maker.add_argument("--quiet", action="store_true", help="print nothing but errors")
-    maker.set_defaults(function=kit)
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@ labels."""
 
 import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from manifold3d import CrossSection, JoinType, Manifold
@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 
 from kitting_drake.hkd.fabrication.labels import engrave_labels
 from kitting_drake.hkd.fabrication.notches import cut_notches
+from kitting_drake.hkd.fabrication.outside import Outside, shaped
 from kitting_drake.hkd.fabrication.recess import Recess
+from kitting_drake.hkd.fabrication.splitting.opening import Opening
 from kitting_drake.hkd.kits.block import ARC_SEGMENTS, Cavity, build_block
 from kitting_drake.hkd.kits.kit import Kit
 from kitting_drake.hkd.kits.layout import kit_cavities
@@ -39,6 +41,8 @@ class Design:
     """A sentence on each notch or label that found no room."""
     compensation: float = 0.0
     """How much wider the cavities are than those of `kit`, on each side, in metres."""
+    outside: Outside = field(default_factory=Outside)
+    """The shape of the block's outside; only the solids have it."""
 
     @property
     def size_mm(self) -> tuple[float, float, float]:
@@ -52,7 +56,12 @@ class Design:
 
 
 def design_kit(
-    kit: Kit, *, notches: bool = False, labels: bool = False, compensation: float = 0.0
+    kit: Kit,
+    *,
+    notches: bool = False,
+    labels: bool = False,
+    compensation: float = 0.0,
+    outside: Outside | None = None,
 ) -> Design:
     """Designs the block of a kit, with notches and labels on request where they fit.
 
@@ -61,6 +70,7 @@ def design_kit(
         notches: whether to add finger notches.
         labels: whether to engrave the tools' names.
         compensation: see `Design.compensation`.
+        outside: see `Design.outside`.
     """
     cavities = tuple(
         dataclasses.replace(
@@ -83,16 +93,11 @@ def design_kit(
             added, refused = cut(kit, cavities, tuple(recesses))
             recesses += added
             notes += refused
-    return Design(kit, cavities, tuple(recesses), tuple(notes), compensation)
+    return Design(kit, cavities, tuple(recesses), tuple(notes), compensation, outside or Outside())
 
 
-def solid(design: Design) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Returns the block's surface in the frame of the files (see `in_block`).
-
-    Returns:
-        Vertices (n, 3) in millimetres and triangles (m, 3). The surface is watertight, and its
-        triangles are wound so that the normals point outward.
-    """
+def solid(design: Design) -> Manifold:
+    """Returns the block in the frame of the files, in mm (see `in_block`)."""
     parameters = design.kit.parameters
     block = build_block(design.cavities, parameters)
     for recess in design.recesses:
@@ -100,18 +105,48 @@ def solid(design: Design) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
             depth = parameters.height - recess.floor + _ABOVE
             block -= Manifold.extrude(recess.outline, depth).translate((0, 0, recess.floor))
     # Remove details that would collapse when coordinates are rounded to `_DIGITS` decimals.
-    mesh = block.simplify(_FINEST).to_mesh64()
-    corners = 1e3 * np.asarray(mesh.vert_properties, dtype=float)[:, :3]
-    corners[:, :2] = in_block(corners[:, :2] / 1e3, parameters)
+    block = block.simplify(_FINEST)
+    corner = (parameters.length / 2, parameters.width / 2, 0.0)
+    return shaped(block.translate(corner).scale((1e3, 1e3, 1e3)), design.outside)
+
+
+def surface(solid: Manifold) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Returns the surface of a solid, with coordinates rounded as in files.
+
+    Returns:
+        Vertices (n, 3) in millimetres and triangles (m, 3). The surface is watertight, and its
+        triangles are wound so that the normals point outward.
+    """
+    mesh = solid.to_mesh64()
+    corners = np.asarray(mesh.vert_properties, dtype=float)[:, :3]
     vertices, index = np.unique(np.round(corners, _DIGITS) + 0.0, axis=0, return_inverse=True)
     faces = index.reshape(-1)[np.asarray(mesh.tri_verts, dtype=np.int64)]
     a, b, c = faces.T
     return vertices, faces[(a != b) & (b != c) & (c != a)]
 
 
-def test_piece() -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def openings(design: Design) -> list[Opening]:
+    """Returns what is cut into the block from above, in the frame of the files."""
+    parameters, raised = design.kit.parameters, design.outside.raised_mm
+
+    def loops(outline: CrossSection) -> CrossSection:
+        return CrossSection(loops_mm(outline, parameters))
+
+    found = [
+        Opening(loops(c.rim), 1e3 * c.floor + raised, below_bevel=loops(c.outline))
+        for c in design.cavities
+    ]
+    found += [
+        Opening(loops(recess.outline), 1e3 * recess.floor + raised, recess.kind == "label")
+        for recess in design.recesses
+        if recess.kind != "cavity"
+    ]
+    return found
+
+
+def test_piece() -> Manifold:
     """Returns a small plate with a square hole, to measure how much too small a printer makes
-    holes.
+    holes. In mm.
 
     The side of the designed hole is `TEST_HOLE_MM`. The compensation to use is half the difference
     between this and the side of the printed hole.
@@ -121,10 +156,7 @@ def test_piece() -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """
     hole = TEST_HOLE_MM
     plate = Manifold.cube((hole + 12.0, hole + 12.0, 8.0))
-    plate -= Manifold.cube((hole, hole, 10.0)).translate((6.0, 6.0, -1.0))
-    mesh = plate.to_mesh64()
-    vertices = np.asarray(mesh.vert_properties, dtype=float)[:, :3]
-    return vertices, np.asarray(mesh.tri_verts, dtype=np.int64)
+    return plate - Manifold.cube((hole, hole, 10.0)).translate((6.0, 6.0, -1.0))
 
 
 def in_block(points: NDArray[np.float64], parameters: KitParameters) -> NDArray[np.float64]:

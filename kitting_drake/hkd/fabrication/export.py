@@ -12,22 +12,45 @@ from typing import Any
 import numpy as np
 import trimesh
 import yaml
+from manifold3d import Manifold
 
 import kitting_drake
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import replace_folder, write_json
 from kitting_drake.hkd.fabrication.block_files import stl_bytes, threemf_bytes
-from kitting_drake.hkd.fabrication.design import Design, design_kit, solid, test_piece
+from kitting_drake.hkd.fabrication.design import (
+    Design,
+    design_kit,
+    openings,
+    solid,
+    surface,
+    test_piece,
+)
 from kitting_drake.hkd.fabrication.drawings import dxf_text, svg_text
-from kitting_drake.hkd.fabrication.picture import picture_png
+from kitting_drake.hkd.fabrication.foam_sheet import (
+    FoamSheet,
+    SheetKit,
+    fill_sheet,
+    kit_of_dxf,
+    kit_of_folder,
+    sheet_dxf,
+    sheet_svg,
+)
+from kitting_drake.hkd.fabrication.kit_request import (
+    KitRequest,
+    check_request,
+    kit_parameters,
+)
+from kitting_drake.hkd.fabrication.outside import Outside, foot_sections
+from kitting_drake.hkd.fabrication.picture import picture_png, sheet_png
+from kitting_drake.hkd.fabrication.splitting.assembly_picture import assembly_png
+from kitting_drake.hkd.fabrication.splitting.pieces import Split, split_block
+from kitting_drake.hkd.fabrication.thin_walls import undercut_notes, wall_notes
 from kitting_drake.hkd.generation.part_models import load_named
-from kitting_drake.hkd.kits.kit import make_kit
+from kitting_drake.hkd.kits.kit import Kit, make_kit
 from kitting_drake.hkd.kits.layout import MOST_TOOLS
 from kitting_drake.hkd.kits.parameters import KitParameters
 from kitting_drake.hkd.tools.tool import Tool, tool_names
-
-FITS = {"snug": 0.15, "easy": 0.35, "loose": 0.75}
-"""Named clearances between a tool and the wall, on each side, in mm."""
 
 RECORD = "kit.json"
 """The name of the file that marks a folder as a kit's."""
@@ -44,30 +67,20 @@ Kit:
 
 
 @dataclass(frozen=True)
-class KitRequest:
-    """A kit to make; lengths in mm."""
+class KitFiles:
+    """What `export_kit` made."""
 
-    tools: tuple[str, ...]
-    """Names of tools, or paths of tool folders."""
-    output: Path
-    clearance_mm: float | None = None
-    """The clearance between a tool and its cavity's wall. None: the template's 2 mm."""
-    compensate_mm: float = 0.0
-    """How much too narrow the printer or router makes cavities, on each side. The cavities in the
-    files to print and cut are wider by this; those of the simulated kit are not."""
-    lead_in_mm: float | None = None
-    """The width of the bevel around the rims. None: the template's 1 mm."""
-    wall_mm: float | None = None
-    block_mm: tuple[float, float, float] | None = None
-    """The block's length, width and height. None: the smallest block found, with the template's
-    height."""
-    notches: bool = False
-    labels: bool = False
-    robot: str = ""
-    """YAML lines that set the robot in the kit's scenario; empty: the default robot."""
+    design: Design
+    block: Manifold
+    """In the frame of the files, in mm."""
+    split: Split | None
+    """The pieces; None: the block is whole."""
+    sheet: FoamSheet | None
+    notes: tuple[str, ...]
+    """What found no room or cannot be printed, in sentences."""
 
 
-def export_kit(request: KitRequest) -> Design:
+def export_kit(request: KitRequest) -> KitFiles:
     """Writes the folder of a kit; replaces a folder written by an earlier call.
 
     Raises:
@@ -76,73 +89,59 @@ def export_kit(request: KitRequest) -> Design:
     """
     if not 1 <= len(request.tools) <= MOST_TOOLS:
         raise UserError(f"a kit holds 1 to {MOST_TOOLS} tools, not {len(request.tools)}")
-    parameters = _parameters(request)
+    check_request(request)
     loaded = {name: load_named(name) for name in dict.fromkeys(request.tools)}
     tools = [loaded[name] for name in request.tools]
+    parameters = kit_parameters(request, loaded)
     folder = request.output
     _check_replaceable(folder)
-    kit = make_kit(tools, parameters)
-    design = design_kit(
-        kit,
-        notches=request.notches,
-        labels=request.labels,
-        compensation=1e-3 * request.compensate_mm,
-    )
+    others = [kit_of_folder(path) for path in request.sheet.others] if request.sheet else []
+    made = _made(request, make_kit(tools, parameters), others)
     new_folders = [p for p in folder.parents if not p.exists()]
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".making-") as scratch:
-            made = Path(scratch) / "kit"
-            made.mkdir()
-            _write(made, design, parameters, request.robot)
-            replace_folder(folder, made, Path(scratch) / "replaced")
+            inside = Path(scratch) / "kit"
+            inside.mkdir()
+            _write(inside, made, parameters, request.robot)
+            replace_folder(folder, inside, Path(scratch) / "replaced")
     except OSError as error:
         raise UserError(f"cannot write {folder}: {error.strerror or error}") from error
     finally:
         for path in new_folders:
             if path.is_dir() and not any(path.iterdir()):
                 path.rmdir()
-    return design
+    return made
 
 
-def _parameters(request: KitRequest) -> KitParameters:
-    """Builds the kit's parameters from a request.
-
-    Raises:
-        UserError: a length is out of range.
-    """
-    parameters = KitParameters(always_nested=True)
-    for flag, value, low, high in (
-        ("--clearance_mm", request.clearance_mm, 0.0, 10.0),
-        ("--wall_mm", request.wall_mm, 2.0, 50.0),
-        ("--lead_in_mm", request.lead_in_mm, 0.0, 5.0),
-        ("--compensate_mm", request.compensate_mm, -1.0, 1.0),
-    ):
-        if value is not None and not low <= value <= high:
-            raise UserError(f"{flag} {value:g} is out of range: give {low:g} to {high:g}")
-    if request.clearance_mm is not None:
-        parameters.clearance = round(1e-3 * request.clearance_mm, 7)
-        # Keep the outline's simplification small compared to the clearance.
-        finest = max(parameters.clearance / 20, 1e-6)
-        parameters.tolerance = min(parameters.tolerance, finest)
-    if request.lead_in_mm is not None:
-        parameters.lead_in = round(1e-3 * request.lead_in_mm, 7)
-    if request.wall_mm is not None:
-        parameters.nested_wall = round(1e-3 * request.wall_mm, 7)
-    if request.block_mm is not None:
-        limits = ((50.0, 1000.0), (50.0, 1000.0), (10.0, 200.0))
-        for value, name, (low, high) in zip(
-            request.block_mm, ("length", "width", "height"), limits, strict=True
-        ):
-            if not low <= value <= high:
-                raise UserError(
-                    f"--block_mm: a {name} of {value:g} is out of range: give {low:g} to {high:g}"
-                )
-        parameters.length, parameters.width, parameters.height = (
-            round(1e-3 * value, 7) for value in request.block_mm
+def _made(request: KitRequest, kit: Kit, others: Sequence[SheetKit]) -> KitFiles:
+    """Designs a kit, splits its block and fills its sheet, as requested."""
+    design = design_kit(
+        kit,
+        notches=request.notches,
+        labels=request.labels,
+        compensation=1e-3 * request.compensate_mm,
+        outside=Outside(request.chamfer_mm, request.gridfinity),
+    )
+    block = solid(design)
+    notes = [
+        *design.notes,
+        *wall_notes(design, 1e-3 * request.nozzle_mm),
+        *undercut_notes(block, design),
+    ]
+    split = sheet = None
+    if request.bed_mm is not None:
+        feet = foot_sections(design.size_mm[:2]) if request.gridfinity else ()
+        split = split_block(block, openings(design), request.bed_mm, request.joint_play_mm, feet)
+        notes += split.notes if split else ()
+    if request.sheet is not None:
+        own = kit_of_dxf(request.output.name, dxf_text(design), design.size_mm[2])
+        wanted = request.sheet
+        sheet = fill_sheet(
+            wanted.size_mm, wanted.margin_mm, wanted.gap_mm, [own, *others], wanted.copies
         )
-        parameters.fixed_size = True
-    return parameters
+        notes += sheet.notes
+    return KitFiles(design, block, split, sheet, tuple(notes))
 
 
 def _check_replaceable(folder: Path) -> None:
@@ -165,17 +164,24 @@ def _check_replaceable(folder: Path) -> None:
         raise UserError(f"{folder} holds {what}, which is not a kit's file: {advice}")
 
 
-def _write(folder: Path, design: Design, parameters: KitParameters, robot: str) -> None:
+def _write(folder: Path, made: KitFiles, parameters: KitParameters, robot: str) -> None:
     """Writes a kit's files into an empty folder."""
-    surface = solid(design)
+    design = made.design
     title = f"Kit of {', '.join(tool.name for tool in design.kit.tools)}"
-    stl = stl_bytes(surface)
-    _check_closed(stl)
-    (folder / "kit.stl").write_bytes(stl)
-    (folder / "kit.3mf").write_bytes(threemf_bytes(surface, title))
-    (folder / "test_piece.stl").write_bytes(stl_bytes(test_piece()))
+    _write_solid(folder / "kit", made.block, title)
+    if made.split is not None:
+        for piece in made.split.pieces:
+            x, y, z = (-float(v) for v in piece.corner)
+            name = f"piece_{piece.number}"
+            _write_solid(folder / name, piece.body.translate((x, y, z)), f"{title}, {name}")
+        (folder / "pieces.png").write_bytes(assembly_png(made.split, openings(design)))
+    (folder / "test_piece.stl").write_bytes(stl_bytes(surface(test_piece())))
     (folder / "cavities.dxf").write_text(dxf_text(design))
     (folder / "cavities.svg").write_text(svg_text(design))
+    if made.sheet is not None:
+        (folder / "sheet.dxf").write_text(sheet_dxf(made.sheet))
+        (folder / "sheet.svg").write_text(sheet_svg(made.sheet))
+        (folder / "sheet.png").write_bytes(sheet_png(made.sheet))
     (folder / "kit.png").write_bytes(picture_png(design))
     shutil.copytree(design.kit.sdf.parent, folder / "sdf")
     names = _bring_tools(design.kit.tools, folder)
@@ -183,7 +189,17 @@ def _write(folder: Path, design: Design, parameters: KitParameters, robot: str) 
     files = sorted(
         path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()
     )
-    write_json(folder / RECORD, {**_record(design, names), "files": [*files, RECORD]})
+    record = {**_record(design, names), "notes": list(made.notes), **_parts_record(made)}
+    write_json(folder / RECORD, {**record, "files": [*files, RECORD]})
+
+
+def _write_solid(stem: Path, solid: Manifold, title: str) -> None:
+    """Writes a solid in mm as STL and 3MF."""
+    triangles = surface(solid)
+    stl = stl_bytes(triangles)
+    _check_closed(stl)
+    stem.with_suffix(".stl").write_bytes(stl)
+    stem.with_suffix(".3mf").write_bytes(threemf_bytes(triangles, title))
 
 
 def _check_closed(stl: bytes) -> None:
@@ -229,6 +245,7 @@ def _record(design: Design, names: Sequence[str]) -> dict[str, Any]:
         "made_by": f"kitting_drake {kitting_drake.__version__}",
         "units": "millimetres; the origin is the lower left corner of the block's bottom",
         "block": list(design.size_mm),
+        "raised_mm": design.outside.raised_mm,
         "compensate_mm": round(1e3 * design.compensation, 4),
         "kit_parameters_m": dataclasses.asdict(design.kit.parameters),
         "tools": [
@@ -246,5 +263,32 @@ def _record(design: Design, names: Sequence[str]) -> dict[str, Any]:
                 design.kit.tools, names, design.kit.layout.poses, design.recesses, strict=False
             )
         ],
-        "notes": list(design.notes),
     }
+
+
+def _parts_record(made: KitFiles) -> dict[str, Any]:
+    """The pieces and the sheet of a kit, in mm, for JSON."""
+    record: dict[str, Any] = {}
+    if made.split is not None:
+        record["pieces"] = [
+            {
+                "file": f"piece_{piece.number}.stl",
+                "position": np.round(piece.corner, 4).tolist(),
+                "size": np.round(piece.size, 4).tolist(),
+            }
+            for piece in made.split.pieces
+        ]
+        record["joint_play_mm"] = made.split.play
+    if made.sheet is not None:
+        record["sheet"] = {
+            "size": list(made.sheet.size),
+            "kits": [
+                {
+                    "name": made.sheet.kits[place.kit].name,
+                    "position": [place.x, place.y],
+                    "turned_deg": 90 if place.turned else 0,
+                }
+                for place in made.sheet.places
+            ],
+        }
+    return record

@@ -8,6 +8,8 @@ from manifold3d import CrossSection, JoinType
 from numpy.typing import NDArray
 
 from kitting_drake.hkd.fabrication.design import Design, loops_mm
+from kitting_drake.hkd.fabrication.foam_sheet import FoamSheet, moved, sheet_layers
+from kitting_drake.hkd.fabrication.splitting.opening import roomiest_point
 from kitting_drake.hkd.tools.solids import MATERIALS
 from kitting_drake.hkd.tools.tool import Tool
 
@@ -18,6 +20,8 @@ _SHALLOW, _DEEP = np.array([0.98, 0.72, 0.26]), np.array([0.83, 0.43, 0.05])
 _SHADOW = (0.20, 0.08, 0.0)
 _LIGHT = np.array([-0.45, 0.55, 0.70]) / np.linalg.norm([-0.45, 0.55, 0.70])
 """The unit vector towards the light, in the kit frame."""
+_ROOMIEST = 0.032
+"""The largest distance of a depth's text from its cavity's wall that is tried, in metres."""
 _INCHES = 7.5
 """The width of each of the two views, in inches."""
 
@@ -49,6 +53,45 @@ def picture_png(design: Design) -> bytes:
     figure.suptitle(
         f"{tools} on {length:g} by {width:g} by {height:g} mm", color=_INK, fontsize=15, x=0.5
     )
+    picture = io.BytesIO()
+    figure.savefig(picture, format="png", dpi=110, facecolor=_PAPER)
+    plt.close(figure)
+    return picture.getvalue()
+
+
+def sheet_png(sheet: FoamSheet) -> bytes:
+    """Draws a sheet with its kits as a PNG."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+    from matplotlib.patches import PathPatch
+    from matplotlib.path import Path
+
+    length, width = sheet.size
+    scale = 11.0 / max(length, width)
+    figure, axes = plt.subplots(
+        figsize=(scale * length + 0.6, scale * width + 0.9), facecolor=_PAPER, layout="constrained"
+    )
+    axes.set_aspect("equal")
+    axes.set_facecolor(_PAPER)
+    axes.tick_params(colors=_FAINT)
+    for spine in axes.spines.values():
+        spine.set_visible(False)
+    axes.set_xlim(-0.01 * length, 1.01 * length)
+    axes.set_ylim(-0.01 * width, 1.01 * width)
+    for name, loops in sheet_layers(sheet).items():
+        fill = {"SHEET": "#e9e6dd", "BLOCK": _TOP}.get(name, tuple(_DEEP))
+        path = Path.make_compound_path(*(Path(np.vstack([a, a[:1]]), closed=True) for a in loops))
+        axes.add_artist(PathPatch(path, facecolor=fill, edgecolor=_INK, linewidth=0.4))
+    for number, place in enumerate(sheet.places):
+        corner = moved(np.array([[0.0, 0.0], sheet.kits[place.kit].size]), place, sheet)
+        x, y = corner.min(axis=0)
+        name = sheet.kits[place.kit].name
+        axes.text(x + 2, y + 2, f"{number + 1} {name}", color="#ffffff", fontsize=7, va="bottom")
+    count = len(sheet.places)
+    kits = "1 kit" if count == 1 else f"{count} kits"
+    axes.set_title(f"{kits} on {length:g} by {width:g} mm", color=_INK, fontsize=13)
     picture = io.BytesIO()
     figure.savefig(picture, format="png", dpi=110, facecolor=_PAPER)
     plt.close(figure)
@@ -106,7 +149,7 @@ def _fill(axes: Any, design: Design, outline: CrossSection, colour: Any, alpha: 
 def _draw_depths(axes: Any, design: Design) -> None:
     """Writes each cavity's depth at the point farthest from the cavity's wall."""
     for cavity, recess in zip(design.cavities, design.recesses, strict=False):
-        point = _roomiest_point(cavity.outline)
+        point = roomiest_point(cavity.outline, _ROOMIEST)
         x, y = 1e3 * (point + np.array(design.kit.size[:2]) / 2)
         axes.text(
             x,
@@ -119,19 +162,6 @@ def _draw_depths(axes: Any, design: Design) -> None:
             fontweight="bold",
             bbox={"boxstyle": "round,pad=0.25", "facecolor": (1, 1, 1, 0.72), "edgecolor": "none"},
         )
-
-
-def _roomiest_point(outline: CrossSection) -> NDArray[np.float64]:
-    """Returns an approximation of the point (2) of an outline farthest from its boundary."""
-    distance = 0.032
-    while distance > 1e-4:
-        inner = outline.offset(-distance, JoinType.Round)
-        if not inner.is_empty():
-            x_min, y_min, x_max, y_max = inner.decompose()[0].bounds()
-            return np.array([(x_min + x_max) / 2, (y_min + y_max) / 2])
-        distance *= 0.85
-    x_min, y_min, x_max, y_max = outline.bounds()
-    return np.array([(x_min + x_max) / 2, (y_min + y_max) / 2])
 
 
 def _draw_measures(axes: Any, design: Design) -> None:

@@ -34,6 +34,9 @@ SLOTS = {
 MOST_TOOLS = 12
 """The largest number of tools in a kit."""
 
+_SHALLOWEST = 0.003
+"""The least depth of a cavity below its bevel, in metres."""
+
 _SIZE_STEP = 0.001
 """The length and width of a nested block are multiples of this, in metres."""
 
@@ -60,13 +63,18 @@ class KitLayout:
 
 
 def slot_pose(tool: Tool, parameters: KitParameters) -> CavityPose:
-    """Returns the pose of a tool in its category's slot, with its top flush with the block's.
+    """Returns the pose of a tool in its category's slot.
 
     Raises:
         KeyError: the tool's category has no slot.
     """
     x, y = SLOTS[tool.category]
-    return CavityPose(x, y, parameters.height - tool.height)
+    return CavityPose(x, y, _floor(tool, parameters))
+
+
+def _floor(tool: Tool, parameters: KitParameters) -> float:
+    """The height of a tool's floor in the kit frame: its top is flush, or stands out."""
+    return parameters.height - tool.height + parameters.stand_out
 
 
 def cavity_outline(outline: CrossSection, parameters: KitParameters) -> CrossSection:
@@ -94,19 +102,13 @@ def layout_kit(tools: Sequence[Tool], parameters: KitParameters) -> KitLayout:
     """Chooses the block's size and the poses of the tools: in their slots if they fit, else nested.
 
     Raises:
-        UserError: there are no tools or too many, a tool is too high for the block, or the tools do
-            not fit on a block.
+        UserError: there are no tools or too many, a tool is too high for the block or stands out of
+            it too far, or the tools do not fit on a block.
     """
     if not 1 <= len(tools) <= MOST_TOOLS:
         raise UserError(f"a kit holds 1 to {MOST_TOOLS} tools, not {len(tools)}")
     for tool in tools:
-        if parameters.height - tool.height < parameters.minimum_wall - 1e-9:
-            raise UserError(
-                f"'{tool.name}' is {1000.0 * tool.height:.1f} mm high: in a block of "
-                f"{1000.0 * parameters.height:.1f} mm, less than "
-                f"{1000.0 * parameters.minimum_wall:.1f} mm (kit.minimum_wall) would be left "
-                "below it; use a higher block"
-            )
+        _check_height(tool, parameters)
     categories = [tool.category for tool in tools]
     unlike = len(set(categories)) == len(categories) and set(categories) <= set(SLOTS)
     if unlike and not parameters.always_nested:
@@ -116,9 +118,26 @@ def layout_kit(tools: Sequence[Tool], parameters: KitParameters) -> KitLayout:
     return _nested_layout(tools, parameters)
 
 
+def _check_height(tool: Tool, parameters: KitParameters) -> None:
+    """Raises UserError if a tool is too high for the block, or hardly in it."""
+    if _floor(tool, parameters) < parameters.minimum_wall - 1e-9:
+        raise UserError(
+            f"'{tool.name}' is {1e3 * tool.height:.1f} mm high: in a block of "
+            f"{1e3 * parameters.height:.1f} mm, less than "
+            f"{1e3 * parameters.minimum_wall:.1f} mm (kit.minimum_wall) would be left below it; "
+            "use a higher block"
+        )
+    most = tool.height - parameters.lead_in - _SHALLOWEST
+    if parameters.stand_out > max(most, 0.0) + 1e-9:
+        raise UserError(
+            f"'{tool.name}' is {1e3 * tool.height:.1f} mm high and is not held if it stands out by "
+            f"{1e3 * parameters.stand_out:g} mm: let it stand out by at most {1e3 * most:.1f} mm"
+        )
+
+
 def _nested_layout(tools: Sequence[Tool], parameters: KitParameters) -> KitLayout:
     def shape(tool: Tool) -> NestedShape:
-        outline = cavity_outline(tool.footprint, parameters)
+        outline = cavity_outline(tool.footprint, parameters.of_tool(tool.name))
         rim = Cavity(outline, 0.0, parameters.height, parameters.lead_in).rim
         return NestedShape(rim, released_fingers(tool))
 
@@ -132,7 +151,7 @@ def _nested_layout(tools: Sequence[Tool], parameters: KitParameters) -> KitLayou
     return KitLayout(
         dataclasses.replace(parameters, length=length, width=width),
         tuple(
-            CavityPose(pose.x, pose.y, parameters.height - tool.height, math.radians(pose.yaw_deg))
+            CavityPose(pose.x, pose.y, _floor(tool, parameters), math.radians(pose.yaw_deg))
             for tool, pose in zip(tools, nesting.poses, strict=True)
         ),
     )
@@ -212,7 +231,7 @@ def kit_cavities(
     poses = layout_kit(tools, parameters).poses if poses is None else poses
     return [
         Cavity(
-            moved_outline(cavity_outline(tool.footprint, parameters), pose),
+            moved_outline(cavity_outline(tool.footprint, parameters.of_tool(tool.name)), pose),
             pose.z,
             parameters.height,
             parameters.lead_in,

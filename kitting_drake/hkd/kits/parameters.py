@@ -1,6 +1,6 @@
 """The template of a kit."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from systems.bounds import bounded
 
@@ -16,14 +16,20 @@ class KitParameters:
 
     # The block's extents along x, y and z. A nested block has this length and width only if
     # `fixed_size` is set.
-    length: float = bounded(0.280, 0.05, 1.0)
-    width: float = bounded(0.260, 0.05, 1.0)
+    length: float = bounded(0.280, 0.04, 1.0)
+    width: float = bounded(0.260, 0.04, 1.0)
     height: float = bounded(0.050, 0.01, 0.2)
 
     # Free space between a seated tool's outline and the wall. Below 1 mm, the tools get collision
     # hulls whose outlines are within 0.05 mm of the true ones, and the tolerance is at most a
     # twentieth of the clearance.
     clearance: float = bounded(0.002, 0.0, 0.01)
+
+    # Clearances of single tools by name, instead of `clearance`.
+    clearance_of: dict[str, float] = field(default_factory=dict, metadata={"range": (0.0, 0.01)})
+
+    # By how much the tops of seated tools stand out of the block's top; 0: flush.
+    stand_out: float = bounded(0.0, 0.0, 0.1)
 
     # Radius of the morphological closing: notches narrower than twice this are bridged.
     closing_radius: float = bounded(0.008, 0.0, 0.03)
@@ -47,11 +53,22 @@ class KitParameters:
     fixed_size: bool = False
 
     @property
+    def least_clearance(self) -> float:
+        """The least clearance of any tool, in metres."""
+        return min([self.clearance, *self.clearance_of.values()])
+
+    @property
     def is_tight(self) -> bool:
-        """Whether the clearance is so small that finer contact geometry is needed."""
-        return self.clearance < TIGHT
+        """Whether a clearance is so small that finer contact geometry is needed."""
+        return self.least_clearance < TIGHT
+
+    def of_tool(self, name: str) -> "KitParameters":
+        """Returns the parameters with the clearance of a tool."""
+        if name not in self.clearance_of:
+            return self
+        return replace(self, clearance=self.clearance_of[name], clearance_of={})
 
     def with_fine_walls(self) -> "KitParameters":
         """Returns the parameters with a tolerance that suits the clearance, if that is tight."""
-        finest = max(self.clearance / 20, _FINEST)
+        finest = max(self.least_clearance / 20, _FINEST)
         return replace(self, tolerance=min(self.tolerance, finest)) if self.is_tight else self

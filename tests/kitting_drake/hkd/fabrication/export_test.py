@@ -22,7 +22,8 @@ from scipy.spatial import cKDTree
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.hkd.fabrication.design import design_kit
-from kitting_drake.hkd.fabrication.export import KitRequest, export_kit
+from kitting_drake.hkd.fabrication.export import export_kit
+from kitting_drake.hkd.fabrication.kit_request import KitRequest
 from kitting_drake.hkd.fabrication.notches import _is_wall_between
 from kitting_drake.hkd.importing.importer import ImportRequest, import_tool
 from kitting_drake.hkd.kits.block import Cavity
@@ -254,7 +255,8 @@ def test_notches_of_one_tool_have_a_wall_between_them(apart: float, inside: bool
 
 def test_a_note_on_a_missing_notch_and_a_label_on_the_floor(bar: Path, tmp_path: Path):
     request = KitRequest((str(bar),), tmp_path, wall_mm=2.0, notches=True, labels=True)
-    design = export_kit(request)
+    made = export_kit(request)
+    design = made.design
     assert len(design.notes) == 1
     assert "notch" in design.notes[0] and "'bar'" in design.notes[0]
     assert record(tmp_path)["notes"] == list(design.notes)
@@ -287,7 +289,8 @@ def test_a_block_of_given_size(tmp_path: Path):
 
 @pytest.mark.parametrize("clearance", [0.1, pytest.param(0.2, marks=pytest.mark.slow)])
 def test_a_small_clearance_is_kept(clearance: float, tmp_path: Path):
-    design = export_kit(KitRequest(("claw_hammer",), tmp_path / "kit", clearance_mm=clearance))
+    request = KitRequest(("claw_hammer",), tmp_path / "kit", clearance_mm=clearance)
+    design = export_kit(request).design
     kit = design.kit
     pose = kit.layout.poses[0]
     outline = kit.tools[0].footprint.rotate(math.degrees(pose.yaw)).translate((pose.x, pose.y))

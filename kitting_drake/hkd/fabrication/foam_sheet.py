@@ -1,0 +1,297 @@
+"""Fills a foam sheet or a drawer with kits, and draws it in true millimetres."""
+
+import io
+import itertools
+import json
+import math
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.extras import import_extra
+from kitting_drake.hkd.fabrication.closed_lines import add_layer, new_dxf, svg_path, text_of
+
+MOST_KITS = 60
+"""The largest number of kits on a sheet."""
+
+_MIXTURES = 40
+"""How many mixtures of upright and turned copies are tried."""
+_SHEET, _BLOCK = "SHEET", "BLOCK"
+_STROKES = ("#0b5fa5", "#2b8a3e", "#9c36b5", "#d9480f", "#087f5b", "#a61e4d", "#5f3dc4")
+_COLOURS = (4, 3, 6, 30, 2, 1, 150, 80)
+
+
+@dataclass(frozen=True)
+class SheetKit:
+    """The drawing of a kit."""
+
+    name: str
+    size: tuple[float, float]
+    """Length and width of its block, in mm."""
+    height: float
+    """Of its block, in mm."""
+    layers: dict[str, list[NDArray[np.float64]]]
+    """Closed loops (n, 2) in mm by layer; the origin is the block's lower left corner."""
+
+
+@dataclass(frozen=True)
+class KitPlace:
+    """A kit on a sheet."""
+
+    kit: int
+    """Its index."""
+    x: float
+    y: float
+    """The lower left corner of its block, in mm."""
+    turned: bool
+    """By 90 degrees, counter-clockwise."""
+
+
+@dataclass(frozen=True)
+class FoamSheet:
+    """A sheet with kits."""
+
+    size: tuple[float, float]
+    margin: float
+    """The least distance of a block from the sheet's edge, in mm."""
+    gap: float
+    """The least distance between two blocks, in mm."""
+    kits: tuple[SheetKit, ...]
+    places: tuple[KitPlace, ...]
+    notes: tuple[str, ...]
+    """What found no room, in sentences."""
+
+
+def kit_of_dxf(name: str, text: str, height: float) -> SheetKit:
+    """A kit from the text of its `cavities.dxf`.
+
+    Raises:
+        UserError: the text is no drawing of `hkd kit`.
+        MachineError: ezdxf is not installed.
+    """
+    ezdxf = import_extra("ezdxf", purpose="DXF", extra="fabrication")
+    layers: dict[str, list[NDArray[np.float64]]] = {}
+    try:
+        for line in ezdxf.read(io.StringIO(text)).modelspace().query("LWPOLYLINE"):
+            layers.setdefault(line.dxf.layer, []).append(np.array(line.get_points("xy")))
+        (block,) = layers[_BLOCK]
+    except (ezdxf.DXFError, KeyError, ValueError) as error:
+        raise UserError(f"'{name}': its cavities.dxf is damaged: make the kit again") from error
+    length, width = block.max(axis=0)
+    return SheetKit(name, (float(length), float(width)), height, layers)
+
+
+def kit_of_folder(folder: Path) -> SheetKit:
+    """A kit that `hkd kit` wrote before.
+
+    Raises:
+        UserError: the folder has no kit.
+    """
+    try:
+        record = json.loads((folder / "kit.json").read_text())
+        height = float(record["block"][2])
+        text = (folder / "cavities.dxf").read_text()
+    except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
+        raise UserError(f"{folder} is not a folder that `hkd kit` wrote") from error
+    return kit_of_dxf(folder.name, text, height)
+
+
+def fill_sheet(
+    size: tuple[float, float],
+    margin: float,
+    gap: float,
+    kits: Sequence[SheetKit],
+    copies: int | None,
+) -> FoamSheet:
+    """Places kits on a sheet, turned by 90 degrees where that helps.
+
+    Args:
+        size: the sheet's sides, in mm.
+        margin: see `FoamSheet`.
+        gap: see `FoamSheet`.
+        kits: at least one.
+        copies: how many of each; None: as many as find room, one of each in turn.
+
+    Raises:
+        UserError: a kit is larger than the sheet.
+    """
+    room = (size[0] - 2 * margin, size[1] - 2 * margin)
+    for kit in kits:
+        if not any(a <= room[0] and b <= room[1] for a, b in (kit.size, kit.size[::-1])):
+            block, given = (f"{a:g} by {b:g} mm" for a, b in (kit.size, size))
+            raise UserError(
+                f"'{kit.name}' of {block} does not fit on a sheet of {given} with margins of "
+                f"{margin:g} mm"
+            )
+    best: list[KitPlace] = []
+    for places in _packings(room, gap, kits, copies):
+        if _merit(places, kits) > _merit(best, kits):
+            best = places
+    placed = tuple(
+        KitPlace(p.kit, round(p.x + margin, 4), round(p.y + margin, 4), p.turned) for p in best
+    )
+    notes = []
+    for index, kit in enumerate(kits):
+        count = sum(place.kit == index for place in placed)
+        if count < (copies or 1):
+            notes.append(
+                f"{(copies or 1) - count} of {copies or 1} '{kit.name}' find no room on the sheet"
+            )
+    heights = sorted({kit.height for kit in kits})
+    if len(heights) > 1:
+        text = " and ".join(f"{height:g}" for height in heights)
+        notes.append(f"the kits are made for blocks of different heights: {text} mm")
+    return FoamSheet(size, margin, gap, tuple(kits), placed, tuple(notes))
+
+
+def _merit(places: Sequence[KitPlace], kits: Sequence[SheetKit]) -> tuple[int, float]:
+    """Prefers that no kit is missing, then the larger covered area."""
+    present = len({place.kit for place in places})
+    return present, sum(math.prod(kits[place.kit].size) for place in places)
+
+
+def _packings(
+    room: tuple[float, float], gap: float, kits: Sequence[SheetKit], copies: int | None
+) -> Iterator[list[KitPlace]]:
+    """Packings to choose from."""
+    areas = [math.prod(kit.size) for kit in kits]
+    largest_first = sorted(range(len(kits)), key=lambda i: -areas[i])
+    most = MOST_KITS if copies is None else copies * len(kits)
+    rounds = itertools.islice(itertools.cycle(largest_first), most)
+    order = list(rounds) if copies is None else [i for i in largest_first for _ in range(copies)]
+    patterns: list[Sequence[bool] | None] = [None]
+    if len(kits) == 1:
+        count = min(len(order), int(room[0] * room[1] / areas[0]) + 1)
+        order = order[:count]
+        # Some copies one way, the rest the other way; then mixtures, as in a pinwheel.
+        for first, number in itertools.product((False, True), range(count + 1)):
+            patterns.append([first] * number + [not first] * (count - number))
+        mixtures = np.random.default_rng(0).random((_MIXTURES, count)) < 0.5
+        patterns += mixtures.tolist()
+    for by_rows, turned in itertools.product((True, False), patterns):
+        yield _packed(room, gap, kits, order, turned, by_rows)
+
+
+def _packed(
+    room: tuple[float, float],
+    gap: float,
+    kits: Sequence[SheetKit],
+    order: Sequence[int],
+    turned: Sequence[bool] | None,
+    by_rows: bool,
+) -> list[KitPlace]:
+    """Places each kit in order as low (or as far left) as possible; leaves out what has no room."""
+    places: list[KitPlace] = []
+    boxes = np.empty((0, 4))
+    hopeless: set[tuple[int, bool | None]] = set()
+    for number, kit in enumerate(order):
+        choice = None if turned is None else turned[number]
+        if (kit, choice) in hopeless:
+            continue
+        options = []
+        for turn in (False, True) if choice is None else (choice,):
+            sides = np.array(kits[kit].size[::-1] if turn else kits[kit].size)
+            corner = _free_corner(room, gap, boxes, sides, by_rows)
+            if corner is not None:
+                far = corner + sides
+                key = (far[1], far[0]) if by_rows else (far[0], far[1])
+                options.append((*key, turn, corner, sides))
+        if not options:
+            hopeless.add((kit, choice))
+            continue
+        _, _, turn, corner, sides = min(options, key=lambda option: option[:3])
+        boxes = np.vstack([boxes, [*corner, *(corner + sides)]])
+        places.append(KitPlace(kit, float(corner[0]), float(corner[1]), turn))
+    return places
+
+
+def _free_corner(
+    room: tuple[float, float],
+    gap: float,
+    boxes: NDArray[np.float64],
+    sides: NDArray[np.float64],
+    by_rows: bool,
+) -> NDArray[np.float64] | None:
+    """The lowest (leftmost) place of a rectangle among others, or None."""
+    xs = np.concatenate([[0.0], boxes[:, 2] + gap])
+    ys = np.concatenate([[0.0], boxes[:, 3] + gap])
+    x, y = (axis.ravel() for axis in np.meshgrid(xs, ys))
+    inside = (x + sides[0] <= room[0] + 1e-6) & (y + sides[1] <= room[1] + 1e-6)
+    x, y = x[inside], y[inside]
+    near = gap - 1e-6
+    apart = (
+        (x[:, None] + sides[0] + near <= boxes[:, 0])
+        | (boxes[:, 2] + near <= x[:, None])
+        | (y[:, None] + sides[1] + near <= boxes[:, 1])
+        | (boxes[:, 3] + near <= y[:, None])
+    )
+    free = apart.all(axis=1)
+    if not free.any():
+        return None
+    x, y = x[free], y[free]
+    first = np.lexsort((x, y) if by_rows else (y, x))[0]
+    return np.array([x[first], y[first]])
+
+
+def sheet_layers(sheet: FoamSheet) -> dict[str, list[NDArray[np.float64]]]:
+    """The closed loops (n, 2) of a sheet in mm by layer: SHEET, BLOCK, then one for each depth."""
+    length, width = sheet.size
+    layers = {_SHEET: [np.array([(0, 0), (length, 0), (length, width), (0, width)], dtype=float)]}
+    layers[_BLOCK] = []
+    for place in sheet.places:
+        for name, loops in sheet.kits[place.kit].layers.items():
+            layers.setdefault(name, []).extend(moved(loop, place, sheet) for loop in loops)
+    depths = sorted((name for name in layers if name not in (_SHEET, _BLOCK)), key=_depth_order)
+    return {name: layers[name] for name in (_SHEET, _BLOCK, *depths)}
+
+
+def moved(points: NDArray[np.float64], place: KitPlace, sheet: FoamSheet) -> NDArray[np.float64]:
+    """Moves points (n, 2) from a kit's frame to its place on the sheet, in mm."""
+    if place.turned:
+        width = sheet.kits[place.kit].size[1]
+        points = np.column_stack([width - points[:, 1], points[:, 0]])
+    return np.round(points + np.array([place.x, place.y]), 4)
+
+
+def _depth_order(name: str) -> tuple[str, float]:
+    kind, _, rest = name.partition("_")
+    number = re.match(r"[0-9.]+", rest)
+    return kind, float(number[0]) if number else 0.0
+
+
+def sheet_dxf(sheet: FoamSheet) -> str:
+    """A DXF of the sheet, with the layers of `sheet_layers`."""
+    document: Any = new_dxf()
+    length, width = sheet.size
+    for number, (name, loops) in enumerate(sheet_layers(sheet).items()):
+        colour = {_SHEET: 8, _BLOCK: 7}.get(name, _COLOURS[number % len(_COLOURS)])
+        add_layer(document, name, colour, loops)
+    document.header["$EXTMIN"], document.header["$EXTMAX"] = (0, 0, 0), (length, width, 0)
+    document.set_modelspace_vport(height=1.1 * max(length, width), center=(length / 2, width / 2))
+    return text_of(document)
+
+
+def sheet_svg(sheet: FoamSheet) -> str:
+    """An SVG of the sheet with 1 mm user units and a group for each of its layers."""
+    length, width = sheet.size
+    names = ", ".join(dict.fromkeys(sheet.kits[place.kit].name for place in sheet.places))
+    lines = [
+        '<?xml version="1.0" encoding="UTF-8"?>',
+        f'<svg xmlns="http://www.w3.org/2000/svg" version="1.1" width="{length:g}mm" '
+        f'height="{width:g}mm" viewBox="0 0 {length:g} {width:g}">',
+        f"  <title>Sheet with {len(sheet.places)} kits: {escape(names)}</title>",
+    ]
+    for number, (name, loops) in enumerate(sheet_layers(sheet).items()):
+        stroke = "#000000" if name in (_SHEET, _BLOCK) else _STROKES[number % len(_STROKES)]
+        lines.append(f'  <g id="{name}" fill="none" stroke="{stroke}" stroke-width="0.1">')
+        flipped = (np.column_stack([loop[:, 0], width - loop[:, 1]]) for loop in loops)
+        lines += [f'    <path d="{svg_path(loop)}"/>' for loop in flipped]
+        lines.append("  </g>")
+    return "\n".join([*lines, "</svg>", ""])

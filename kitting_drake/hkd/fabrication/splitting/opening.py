@@ -1,0 +1,73 @@
+"""What is cut into a block from above, as the cuts between pieces see it."""
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from manifold3d import CrossSection, JoinType
+from numpy.typing import NDArray
+
+LEAST_WALL = 1.2
+"""The least thickness of a wall, in mm: three lines of a nozzle of 0.4 mm."""
+
+_SHARPEST = math.radians(42)
+"""Sharper corners count as thin walls."""
+
+
+@dataclass(frozen=True)
+class Opening:
+    """A recess, in mm in the frame of the files."""
+
+    outline: CrossSection
+    """Its outline at the top, outside the bevel."""
+    floor: float
+    """The height of its floor above the block's bottom."""
+    is_label: bool = False
+    below_bevel: CrossSection | None = None
+    """Its outline below the bevel; None: it has no bevel."""
+
+    @property
+    def walls(self) -> CrossSection:
+        """The outline of its upright walls."""
+        return self.outline if self.below_bevel is None else self.below_bevel
+
+
+def united(outlines: Iterable[CrossSection]) -> CrossSection:
+    """The union of outlines."""
+    union = CrossSection()
+    for outline in outlines:
+        union += outline
+    return union
+
+
+def corner_area(least: float) -> float:
+    """The area that `thin_parts` finds at the tip of the sharpest corner that is no thin wall."""
+    return (least / 2) ** 2 * (1 / math.tan(_SHARPEST / 2) - (math.pi - _SHARPEST) / 2)
+
+
+def thin_parts(shape: CrossSection, least: float) -> CrossSection:
+    """The parts of a shape that are thinner than `least`, and the tips of its corners."""
+    inner = shape.offset(-least / 2, JoinType.Round, circular_segments=64)
+    return shape - inner.offset(least / 2, JoinType.Round, circular_segments=64)
+
+
+def roomiest_point(outline: CrossSection, farthest: float) -> NDArray[np.float64]:
+    """An approximation of the point (2) of an outline furthest from its boundary.
+
+    Args:
+        outline: the outline.
+        farthest: the largest distance from the boundary that is tried.
+    """
+    distance = farthest
+    while distance > farthest / 320:
+        inner = outline.offset(-distance, JoinType.Round)
+        if not inner.is_empty():
+            return _middle(inner.decompose()[0])
+        distance *= 0.85
+    return _middle(outline)
+
+
+def _middle(outline: CrossSection) -> NDArray[np.float64]:
+    x_min, y_min, x_max, y_max = outline.bounds()
+    return np.array([(x_min + x_max) / 2, (y_min + y_max) / 2])

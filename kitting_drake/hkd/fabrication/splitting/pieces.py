@@ -1,0 +1,133 @@
+"""Splits a block into pieces that fit a printer's bed."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from manifold3d import CrossSection, JoinType, Manifold
+from numpy.typing import NDArray
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.hkd.fabrication.splitting.cut_lines import TAB_REACH, choose_cuts
+from kitting_drake.hkd.fabrication.splitting.joints import Joint, choose_joints
+from kitting_drake.hkd.fabrication.splitting.opening import LEAST_WALL, Opening
+
+_BEYOND = 1.0
+"""The distance by which cutters stick out of the block, in mm."""
+_MOST_PIECES = 40
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A piece of a block, in the block's frame, in mm."""
+
+    number: int
+    """From 1. A piece is lowered onto those with lower numbers."""
+    body: Manifold
+    region: CrossSection
+    """From above, without the joints."""
+
+    @property
+    def corner(self) -> NDArray[np.float64]:
+        """The lower corner (3) of its bounding box: the origin of its files."""
+        return np.array(self.body.bounding_box()[:3])
+
+    @property
+    def size(self) -> NDArray[np.float64]:
+        """The extents (3)."""
+        return np.array(self.body.bounding_box()[3:]) - self.corner
+
+
+@dataclass(frozen=True)
+class Split:
+    """A block in pieces."""
+
+    pieces: tuple[Piece, ...]
+    joints: tuple[Joint, ...]
+    play: float
+    """Between a dovetail and its socket, on each side, in mm."""
+    notes: tuple[str, ...]
+
+
+def split_block(
+    block: Manifold,
+    openings: Sequence[Opening],
+    bed: tuple[float, float],
+    play: float,
+    feet: Sequence[CrossSection] = (),
+) -> Split | None:
+    """Splits a block that is larger than a bed.
+
+    Args:
+        block: the block, in mm, its lower corner at the origin.
+        openings: what is cut into it from above.
+        bed: the sides of the bed, in mm; pieces may be turned by 90 degrees.
+        play: see `Split.play`.
+        feet: see `choose_cuts`.
+
+    Returns:
+        The pieces, or None if the block fits the bed.
+
+    Raises:
+        UserError: the bed is too small, or each cut leaves a thin wall.
+    """
+    length, width, height = block.bounding_box()[3:]
+    if fits((length, width), bed):
+        return None
+    named = f"--bed {bed[0]:g} {bed[1]:g}"
+    if min(bed) < 4 * TAB_REACH or length * width > _MOST_PIECES * bed[0] * bed[1]:
+        raise UserError(f"{named} is too small for a block of {length:g} by {width:g} mm")
+    cuts = choose_cuts((length, width), openings, bed, feet)
+    if cuts is None:
+        raise UserError(
+            f"{named}: each cut that was tried leaves a wall thinner than {LEAST_WALL:g} mm: use a "
+            "larger --wall_mm or another bed"
+        )
+    joints = choose_joints(cuts.lines, cuts.regions, openings, height, feet)
+    bodies = [block ^ _prism(region, 0.0, height) for region in cuts.regions]
+    for joint in joints:
+        whole = joint.height >= height
+        dovetail = _prism(joint.outline, 0.0, joint.height + _BEYOND * whole)
+        socket = _prism(
+            joint.outline.offset(play, JoinType.Miter),
+            0.0,
+            joint.height + (_BEYOND if whole else play),
+        )
+        bodies[joint.owner] += block ^ dovetail
+        bodies[joint.other] -= socket
+    pieces = tuple(
+        Piece(i + 1, body, region)
+        for i, (body, region) in enumerate(zip(bodies, cuts.regions, strict=True))
+    )
+    too_large = [piece for piece in pieces if not fits(tuple(piece.size[:2]), bed)]
+    assert not too_large, "the cuts' windows leave room for the dovetails"
+    return Split(pieces, tuple(joints), play, tuple(_notes(pieces, joints)))
+
+
+def fits(size: tuple[float, ...], bed: tuple[float, float]) -> bool:
+    """Whether a rectangle fits a bed, turned by 90 degrees if need be."""
+    (a, b), (room_a, room_b) = size, bed
+    tiny = 1e-6
+    return (a <= room_a + tiny and b <= room_b + tiny) or (
+        a <= room_b + tiny and b <= room_a + tiny
+    )
+
+
+def _prism(outline: CrossSection, low: float, high: float) -> Manifold:
+    return Manifold.extrude(outline, high - low + _BEYOND).translate((0, 0, low - _BEYOND))
+
+
+def _notes(pieces: Sequence[Piece], joints: Sequence[Joint]) -> list[str]:
+    """A sentence for each pair of neighbours without a joint."""
+    joined = {(joint.owner, joint.other) for joint in joints}
+    notes = []
+    for i, one in enumerate(pieces):
+        grown = one.region.offset(0.01, JoinType.Miter)
+        for j in range(i + 1, len(pieces)):
+            shared = (grown ^ pieces[j].region).area() / 0.01
+            if shared > 25.0 and (i, j) not in joined:
+                notes.append(
+                    f"pieces {i + 1} and {j + 1} have no room for a dovetail: glue them, or use a "
+                    "larger --wall_mm"
+                )
+    return notes

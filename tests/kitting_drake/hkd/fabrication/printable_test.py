@@ -1,0 +1,98 @@
+"""What slicers and cutters check, on written kits."""
+
+from pathlib import Path
+
+import ezdxf
+import numpy as np
+import pytest
+import trimesh
+from manifold3d import CrossSection, Manifold, Mesh64
+
+from kitting_drake.hkd.fabrication.export import export_kit
+from kitting_drake.hkd.fabrication.kit_request import KitRequest, SheetRequest
+from kitting_drake.hkd.fabrication.splitting.opening import LEAST_WALL, corner_area, thin_parts
+from kitting_drake.hkd.tools.tool import tool_names
+
+
+def solid_of(path: Path) -> Manifold:
+    mesh = trimesh.load_mesh(path)
+    assert mesh.is_watertight and mesh.is_winding_consistent
+    assert len(mesh.split()) == 1
+    return Manifold(Mesh64(np.array(mesh.vertices), mesh.faces.astype(np.uint64)))
+
+
+def thin(shape: CrossSection) -> list[CrossSection]:
+    parts = thin_parts(shape, LEAST_WALL).decompose()
+    return [part for part in parts if part.area() > corner_area(LEAST_WALL)]
+
+
+def check_solid(path: Path) -> None:
+    """Walls of at least 1.2 mm, and nothing printed on air."""
+    solid = solid_of(path)
+    below = solid.slice(0.05)
+    top = solid.bounding_box()[5]
+    for z in np.arange(0.45, top - 0.1, 1.7):
+        layer = solid.slice(z)
+        # Letters are engraved in the uppermost 0.6 mm.
+        if z < top - 0.8:
+            assert not thin(layer), f"{path.name} at {z:g} mm"
+        assert all((part ^ below).area() > 1e-3 for part in layer.decompose())
+        below = layer
+
+
+def check_threemf(path: Path) -> None:
+    lib3mf = pytest.importorskip("lib3mf")
+    model = lib3mf.Wrapper().CreateModel()
+    reader = model.QueryReader("3mf")
+    reader.SetStrictModeActive(True)
+    reader.ReadFromFile(str(path))
+    assert reader.GetWarningCount() == 0
+    objects = model.GetMeshObjects()
+    while objects.MoveNext():
+        assert objects.GetCurrentMeshObject().IsManifoldAndOriented()
+
+
+def check_kit(folder: Path) -> None:
+    solids = sorted(folder.glob("*.3mf"))
+    for path in solids:
+        check_threemf(path)
+        check_solid(path.with_suffix(".stl"))
+    for path in folder.glob("*.dxf"):
+        assert not ezdxf.readfile(path).audit().errors
+
+
+@pytest.mark.parametrize("gridfinity", [False, True])
+def test_slicers_and_cutters_find_nothing(gridfinity: bool, tmp_path: Path):
+    made = export_kit(
+        KitRequest(
+            ("plate_120x40x8", "disc_35x10"),
+            tmp_path / "kit",
+            notches=True,
+            labels=True,
+            chamfer_mm=0.6,
+            gridfinity=gridfinity,
+            bed_mm=(100.0, 100.0),
+            sheet=SheetRequest((400.0, 300.0)),
+        )
+    )
+    assert made.split is not None
+    check_kit(tmp_path / "kit")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(5))
+def test_slicers_and_cutters_find_nothing_in_random_kits(seed: int, tmp_path: Path):
+    rng = np.random.default_rng(seed)
+    export_kit(
+        KitRequest(
+            tuple(str(name) for name in rng.choice(tool_names(), rng.integers(2, 9))),
+            tmp_path / "kit",
+            clearance_mm=float(rng.choice([0.35, 0.75, 2.0])),
+            wall_mm=float(rng.choice([4.0, 6.0])),
+            notches=bool(rng.random() < 0.5),
+            labels=bool(rng.random() < 0.5),
+            gridfinity=seed == 4,
+            bed_mm=(180.0, 180.0),
+        )
+    )
+    check_kit(tmp_path / "kit")
