@@ -22,6 +22,8 @@ FOOT = ((0.0, 35.6, 0.8), (0.8, 37.2, 1.6), (2.6, 37.2, 1.6), (4.75, 41.5, 3.75)
 """A foot's outline from the bottom up: height, side and radius of the corners, in mm."""
 FOOT_HEIGHT = FOOT[-1][0]
 
+_SECTION_HEIGHTS = (0.0, 1.7, 3.2, 3.8, 4.4)
+"""Heights of the feet's sections, in mm."""
 _ARC_SEGMENTS = 64
 
 
@@ -75,18 +77,21 @@ def shaped(block: Manifold, outside: Outside) -> Manifold:
 
 
 def foot_sections(size: tuple[float, float]) -> list[CrossSection]:
-    """The feet of a block from above, in mm: at their bottom, and at half of their height.
+    """Returns sections of a block's feet at several heights, the lowest first, in mm.
 
     Args:
         size: the block's length and width.
     """
+    heights, sides, radii = np.array(FOOT).T
     sections = []
-    for _, side, radius in FOOT[:2]:
-        hull = CrossSection.hull_points(_ring((side, side), radius, 0.0, 0.0)[:, :2])
+    for z in _SECTION_HEIGHTS:
+        side = float(np.interp(z, heights, sides))
+        ring = _ring((side, side), float(np.interp(z, heights, radii)), 0.0, 0.0)
+        foot = CrossSection.hull_points(ring[:, :2])
         inset = (PITCH - GAP - side) / 2
         section = CrossSection()
         for column, row in _cells(size):
-            section += hull.translate((PITCH * column + inset, PITCH * row + inset))
+            section += foot.translate((PITCH * column + inset, PITCH * row + inset))
         sections.append(section)
     return sections
 

@@ -31,8 +31,8 @@ TAB_REACH = 8.0
 _CELL = 0.5
 # Costs of a cut per mm: through solid material, along a wall, across a cavity, through a label.
 _SOLID, _WALL, _CAVITY, _LABEL = 1.0, 30.0, 12.0, 8.0
-_FOOT, _FOOT_SIDE = 1.0, 8.0
-"""Additional costs per mm through a foot, and along its side."""
+_FOOT, _FOOT_SIDE, _OFF_THE_MIDDLE = 2.0, 8.0, 0.3
+"""Additional costs per mm through a foot, along its side, and for each mm nearer to a foot."""
 _ROOMY = 4.0
 """Cuts keep this distance from cavities where they can, in mm."""
 _STEEPEST = 4
@@ -161,12 +161,14 @@ class _Cutter:
     def _foot_prices(self, feet: Sequence[CrossSection]) -> NDArray[np.float64]:
         """The additional cost per mm of a cut through feet, and along their sides."""
         price = np.zeros(self._counts)
-        for section in feet[:1]:
-            inside = self._mask(section)
+        if feet:
+            inside = self._mask(feet[0])
+            from_foot = ndimage.distance_transform_edt(~inside) * _CELL
+            within = ndimage.distance_transform_edt(inside) * _CELL
             near = LEAST_WALL + _CELL
-            edge = ndimage.distance_transform_edt(inside) * _CELL < near
-            edge &= ndimage.distance_transform_edt(~inside) * _CELL < near
-            price += _FOOT * inside + _FOOT_SIDE * edge
+            price += _FOOT * inside + _FOOT_SIDE * ((from_foot < near) & (within < near))
+            # The middle between two feet is best, because feet are wider above.
+            price += _OFF_THE_MIDDLE * (from_foot.max() - from_foot) * ~inside
         return price
 
     def cuts(self, counts: tuple[int, int]) -> Cuts | None:
