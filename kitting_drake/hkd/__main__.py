@@ -129,7 +129,6 @@ def trace(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
 
 def kit(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
     """Makes a kit of 1 to 12 tools: to print (STL, 3MF), to cut (DXF, SVG) and to simulate."""
-    # Drake is slow to import, and the other verbs do not need it.
     from kitting_drake.hkd.fabrication.export import export_kit
 
     request = request_of(args, "" if args.robot is None else _robot_text(args.robot))
