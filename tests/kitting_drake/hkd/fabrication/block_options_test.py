@@ -21,6 +21,7 @@ from kitting_drake.hkd.kits.kit import make_kit
 from kitting_drake.hkd.kits.layout import CavityPose, kit_cavities, layout_kit
 from kitting_drake.hkd.kits.parameters import KitParameters
 from kitting_drake.scenario.loader import load_scenario
+from systems.bounds import check_bounds
 
 PLATE, THICK, ROD = "plate_90x40x8", "plate_90x40x9", "rod_80x14"
 
@@ -179,6 +180,12 @@ def test_bad_input_is_answered_in_one_sentence(
     assert done.returncode == 2
     assert token in done.stderr.strip().splitlines()[-1]
     assert not (tmp_path / "kit").exists()
+
+
+def test_the_fit_of_a_tool_has_a_range():
+    check_bounds(KitParameters(clearance_of={ROD: 0.001}))
+    with pytest.raises(ValueError, match=r"^clearance_of\.rod_80x14 must be between 0 and 0\.01"):
+        check_bounds(KitParameters(clearance_of={ROD: 0.02}))
 
 
 def test_cavities_by_name_keep_the_default_elsewhere():
