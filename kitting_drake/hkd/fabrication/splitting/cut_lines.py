@@ -31,7 +31,7 @@ TAB_REACH = 8.0
 _CELL = 0.5
 # Costs of a cut per mm: through solid material, along a wall, across a cavity, through a label.
 _SOLID, _WALL, _CAVITY, _LABEL = 1.0, 30.0, 12.0, 8.0
-_FOOT, _FOOT_SIDE, _OFF_THE_MIDDLE = 2.0, 8.0, 0.3
+_FOOT, _FOOT_SIDE, _OFF_THE_MIDDLE = 3.0, 8.0, 2.0
 """Additional costs per mm through a foot, along its side, and for each mm nearer to a foot."""
 _ROOMY = 4.0
 """Cuts keep this distance from cavities where they can, in mm."""

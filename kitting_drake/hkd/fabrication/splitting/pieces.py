@@ -15,6 +15,8 @@ from kitting_drake.hkd.fabrication.splitting.opening import LEAST_WALL, Opening
 _BEYOND = 1.0
 """The distance by which cutters stick out of the block, in mm."""
 _MOST_PIECES = 40
+_UPRIGHT = 2
+"""How many of the sections of the feet are below their upper slope."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +79,12 @@ def split_block(
     named = f"--bed {bed[0]:g} {bed[1]:g}"
     if min(bed) < 4 * TAB_REACH or length * width > _MOST_PIECES * bed[0] * bed[1]:
         raise UserError(f"{named} is too small for a block of {length:g} by {width:g} mm")
+    notes = []
     cuts = choose_cuts((length, width), openings, bed, feet)
+    if cuts is None and feet:
+        # Only the upright parts of the feet then have no thin walls.
+        cuts = choose_cuts((length, width), openings, bed, feet[:_UPRIGHT])
+        notes.append("cuts beside feet leave thin edges on the slopes of the feet: trim them")
     if cuts is None:
         raise UserError(
             f"{named}: each cut that was tried leaves a wall thinner than {LEAST_WALL:g} mm: use a "
@@ -101,7 +108,7 @@ def split_block(
     )
     too_large = [piece for piece in pieces if not fits(tuple(piece.size[:2]), bed)]
     assert not too_large, "the cuts' windows leave room for the dovetails"
-    return Split(pieces, tuple(joints), play, tuple(_notes(pieces, joints)))
+    return Split(pieces, tuple(joints), play, (*notes, *_notes(pieces, joints)))
 
 
 def fits(size: tuple[float, ...], bed: tuple[float, float]) -> bool:
