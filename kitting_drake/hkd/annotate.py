@@ -20,10 +20,10 @@ from kitting_drake.common.paths import MODELS
 from kitting_drake.hkd.generation.catalogue import load_catalogue
 from kitting_drake.hkd.generation.generate import generate_tool
 from kitting_drake.hkd.grasps.grip import find_grip, jaw_axes
+from kitting_drake.hkd.grasps.holds import WIDEST
 from kitting_drake.hkd.grasps.proposals import (
     FLOOR_CLEARANCE,
     GRASP_DEPTH,
-    WIDEST,
     GraspProposal,
     propose_grasps,
 )

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from kitting_drake.common.cached_folder import cached_folder
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import cache_directory
-from kitting_drake.hkd.grasps.proposals import WIDEST, propose_grasps
+from kitting_drake.hkd.grasps.holds import WIDEST
+from kitting_drake.hkd.grasps.proposals import propose_grasps
 from kitting_drake.hkd.tools.tool import Tool
 from systems.grasp import Grasp
 from systems.grip_force import GRAVITY

@@ -12,10 +12,16 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from kitting_drake.hkd.grasps.corners import LEAST_WIDTH, corner_cost
 from kitting_drake.hkd.grasps.grip import find_grip, jaw_axes
+from kitting_drake.hkd.grasps.holds import (
+    BIN,
+    FINGER_COLUMNS,
+    Hold,
+    find_holds,
+    reach_of,
+)
 from systems.grasp import Grasp
-from systems.hand_geometry import FINGER_LENGTH, FINGERTIP_DEPTH, MAX_OPENING, PAD_LENGTH
+from systems.hand_geometry import FINGER_LENGTH, FINGERTIP_DEPTH, PAD_LENGTH
 from systems.pick_place_parameters import PickPlaceParameters
 
 Array = NDArray[np.float64]
@@ -27,10 +33,6 @@ GRASP_DEPTH = PLANNER.grasp_depth
 """The depth of the pads' lower edges below the tool's top."""
 FLOOR_CLEARANCE = PLANNER.floor_clearance
 """The least height of the pads above the table."""
-WIDEST = MAX_OPENING - 0.015
-"""The largest width to grasp; it leaves a margin on either side of the tool."""
-NARROWEST = 0.003
-"""The smallest width to grasp."""
 RELEASE_REACH = PLANNER.release_clearance + FINGERTIP_DEPTH
 """The distance beyond the gripped faces that the fingertips need when they release."""
 
@@ -38,16 +40,10 @@ RELEASE_REACH = PLANNER.release_clearance + FINGERTIP_DEPTH
 # then in the coarse one.
 _TOUCH = 0.0003
 _COARSE_TOUCH = 0.0008
-# The distance by which the upper fingers are set back from the pads.
-_FINGER_RECESS = 0.003
-# The inward lean of a face above which it slips out of the pads, in radians.
-_STEEPEST = np.radians(28.0)
-# The least share of the pads' length along which both must touch, except at a corner.
-_LEAST_CONTACT = 0.15
 # The distance from the middle of a tool in its kit to a neighbouring tool.
 _LANE = 0.040
 
-_BIN, _STEP = 0.0005, 0.001
+_STEP = 0.001
 _COARSE_DEG, _FINE_DEG = 5.0, 0.5
 _MOST_PROPOSALS = 12
 # A proposal is dropped if it is this close to a better one.
@@ -163,7 +159,7 @@ def _slices(triangles: Array, levels: Array) -> tuple[Array, NDArray[np.int64]]:
         rise = np.where(crosses, b[..., 2] - a[..., 2], 1.0)
         share = ((z - a[..., 2]) / rise)[..., None]
         ends = (a + share * (b - a))[crosses][:, :2].reshape(-1, 2, 2)
-        counts = np.ceil(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) / (0.6 * _BIN))
+        counts = np.ceil(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) / (0.6 * BIN))
         counts = counts.astype(int) + 2
         which = np.repeat(np.arange(len(ends)), counts)
         order = np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts)
@@ -171,60 +167,6 @@ def _slices(triangles: Array, levels: Array) -> tuple[Array, NDArray[np.int64]]:
         all_points.append((1 - t) * ends[which, 0] + t * ends[which, 1])
         all_levels.append(np.full(len(which), index))
     return np.concatenate(all_points), np.concatenate(all_levels)
-
-
-@dataclass(frozen=True)
-class _Reach:
-    """The extents of a tool to either side, at each height, in the hand's coordinates.
-
-    At a given rotation of the hand, u is the coordinate along the pads and v the one across them.
-    """
-
-    u_min: float
-    """The u of the first column; each column is `_BIN` long."""
-    left: Array
-    """(columns, levels) the greatest v; -inf where the tool is absent."""
-    right: Array
-    """(columns, levels) the least v; inf where the tool is absent."""
-
-
-@dataclass(frozen=True)
-class _Hold:
-    """How two pads hold a tool; see `GraspProposal` for the measures. Lengths in metres."""
-
-    middle: float
-    """The v halfway between the gripped faces."""
-    width: float
-    top: float
-    contact: float
-    depth: float
-    slope: float
-    overhang: float
-    twist: float
-    """The distance along the pads between the two pads' mean points of contact."""
-    corner: float = 0.0
-    """The cost of holding a corner; 0 for a hold between two faces."""
-
-
-# The number of columns to either side of the middle.
-_PAD_COLUMNS = round(PAD_LENGTH / 2 / _BIN)
-_FINGER_COLUMNS = round(FINGER_LENGTH / 2 / _BIN)
-
-
-def _reach(points: Array, level: NDArray[np.int64], levels: Array, theta: float) -> _Reach:
-    along, across = jaw_axes(theta)
-    u, v = points @ along, points @ across
-    u_min = u.min() - _FINGER_COLUMNS * _BIN
-    columns = int((u.max() - u_min) / _BIN) + _FINGER_COLUMNS + 2
-    bins = ((u - u_min) / _BIN).astype(int)
-    # NumPy's `at` is faster with one index than with two.
-    cells = bins * len(levels) + level
-    left = np.full(columns * len(levels), -np.inf)
-    right = np.full(columns * len(levels), np.inf)
-    np.maximum.at(left, cells, v)
-    np.minimum.at(right, cells, v)
-    shape = columns, len(levels)
-    return _Reach(u_min, left.reshape(shape), right.reshape(shape))
 
 
 def _search(
@@ -251,24 +193,22 @@ def _search(
         corners: whether a corner may be held.
         near: (2,) the point in T close to which to search; None searches along the whole tool.
     """
-    reach = _reach(points, level, levels, theta)
-    first, last = _FINGER_COLUMNS, len(reach.left) - _FINGER_COLUMNS
+    reach = reach_of(points, level, levels, theta)
+    first, last = FINGER_COLUMNS, len(reach.left) - FINGER_COLUMNS
     if near is None:
-        centres = np.arange(first, last, round(_STEP / _BIN))
+        centres = np.arange(first, last, round(_STEP / BIN))
     else:
         along, _ = jaw_axes(theta)
-        centres = round((float(near @ along) - reach.u_min) / _BIN) + np.arange(-4, 5, 2)
+        centres = round((float(near @ along) - reach.u_min) / BIN) + np.arange(-4, 5, 2)
         centres = centres[(centres >= first) & (centres < last)]
-    result = []
-    for centre in centres:
-        hold = _hold(reach, int(centre), levels, touch, planner, corners)
-        if hold is not None:
-            result.append(_proposal(hold, reach.u_min + centre * _BIN, theta, com, planner))
-    return result
+    return [
+        _proposal(hold, reach.u_min + centre * BIN, theta, com, planner)
+        for centre, hold in find_holds(reach, centres, touch, planner, corners=corners)
+    ]
 
 
 def _proposal(
-    hold: _Hold, u: float, theta: float, com: Array, planner: PickPlaceParameters
+    hold: Hold, u: float, theta: float, com: Array, planner: PickPlaceParameters
 ) -> GraspProposal:
     """Makes the proposal of a hold with the pads' middle at `u`, with its penalties."""
     along, across = jaw_axes(theta)
@@ -307,101 +247,6 @@ def _proposal(
         overhang=hold.overhang,
         penalties={cause: float(value) for cause, value in penalties.items()},
     )
-
-
-def _hold(
-    reach: _Reach,
-    centre: int,
-    levels: Array,
-    touch: float,
-    planner: PickPlaceParameters,
-    corners: bool,
-) -> _Hold | None:
-    """Describes how two pads hold the tool when they are centred on a column.
-
-    `find_grip` measures only the distance between the pads. This function also measures their
-    contact.
-
-    Args:
-        reach: the extents of the tool.
-        centre: the column at whose lower edge the pads' middle is.
-        levels: the heights of the slices, in metres.
-        touch: the depth behind the foremost point up to which a pad touches, in metres.
-        planner: the planner's parameters; the pads' depth and their clearance to the table are
-            used.
-        corners: whether a corner may be held.
-
-    Returns:
-        The hold, or None if the pads cannot hold the tool.
-    """
-    fingers = slice(centre - _FINGER_COLUMNS, centre + _FINGER_COLUMNS)
-    finger_left, finger_right = reach.left[fingers], reach.right[fingers]
-    if not NARROWEST <= finger_left.max() - finger_right.min() <= WIDEST + 2 * _FINGER_RECESS:
-        return None
-    pads = slice(centre - _PAD_COLUMNS, centre + _PAD_COLUMNS)
-    occupied = np.flatnonzero(np.isfinite(reach.left[pads]).any(axis=0))
-    if not len(occupied):
-        return None
-    top, step = levels[occupied[-1]], levels[1] - levels[0]
-    bottom = max(top + step / 2 - planner.grasp_depth, planner.floor_clearance)
-    held = (levels >= bottom) & (levels <= top)
-    if not held.any():
-        return None
-    left, right = reach.left[pads][:, held], reach.right[pads][:, held]
-    furthest_left, furthest_right = left.max(), right.min()
-    width = furthest_left - furthest_right
-    if not NARROWEST <= width <= WIDEST:
-        return None
-    # The fingers pass all levels from the tool's top down to the pads' lower edges.
-    passed = levels >= bottom
-    overhang = max(
-        finger_left[:, passed].max() - furthest_left,
-        furthest_right - finger_right[:, passed].min(),
-    )
-    slope = max(_lean(left.max(axis=0), step), _lean(-right.min(axis=0), step))
-    touch_left, touch_right = left >= furthest_left - touch, right <= furthest_right + touch
-    columns_left, columns_right = touch_left.any(axis=1), touch_right.any(axis=1)
-    both = columns_left & columns_right
-    contact, corner = float(both.mean()), 0.0
-    if overhang > _FINGER_RECESS or slope > _STEEPEST:
-        return None
-    if contact >= _LEAST_CONTACT:
-        columns_left = columns_right = both
-    else:
-        allowed = corners and width >= LEAST_WIDTH
-        held_there = corner_cost(left, right, _BIN, touch) if allowed else None
-        if held_there is None:
-            return None
-        corner = held_there
-    rows = (touch_left[columns_left].mean(axis=0) + touch_right[columns_right].mean(axis=0)) / 2
-    places = np.arange(len(left)) * _BIN
-    twist = np.average(places, weights=touch_left.sum(axis=1)) - np.average(
-        places, weights=touch_right.sum(axis=1)
-    )
-    return _Hold(
-        middle=float((furthest_left + furthest_right) / 2),
-        width=float(width),
-        top=float(top),
-        contact=contact,
-        depth=float(min(1.0, rows.sum() * step / planner.grasp_depth)),
-        slope=slope,
-        overhang=float(overhang),
-        twist=float(abs(twist)),
-        corner=corner,
-    )
-
-
-def _lean(profile: Array, step: float) -> float:
-    """Returns the inward lean of a face at a pad's lower edge, in radians.
-
-    Args:
-        profile: how far the face stands out at each level, from the lowest level up, in metres.
-        step: the distance between levels, in metres.
-    """
-    above = min(2, len(profile) - 1)
-    if above == 0 or profile.argmax() > 0 or not np.isfinite(profile[above]):
-        return 0.0
-    return float(np.arctan2(profile[0] - profile[above], above * step))
 
 
 def _distinct(proposals: list[GraspProposal]) -> list[GraspProposal]:

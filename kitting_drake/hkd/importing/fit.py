@@ -5,7 +5,8 @@ from pathlib import Path
 from manifold3d import Manifold
 
 from kitting_drake.common.errors import UserError
-from kitting_drake.hkd.grasps.proposals import WIDEST, GraspProposal, propose_grasps
+from kitting_drake.hkd.grasps.holds import WIDEST
+from kitting_drake.hkd.grasps.proposals import GraspProposal, propose_grasps
 from kitting_drake.hkd.importing.materials import bodies_of
 from kitting_drake.hkd.importing.tool_frame import centred, size
 from kitting_drake.hkd.kits.layout import layout_kit

@@ -16,7 +16,8 @@ from manifold3d import CrossSection, JoinType, Manifold
 from kitting_drake.common.cached_folder import cached_folder
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import cache_directory
-from kitting_drake.hkd.grasps.proposals import WIDEST, GraspProposal, propose_grasps
+from kitting_drake.hkd.grasps.holds import WIDEST
+from kitting_drake.hkd.grasps.proposals import GraspProposal, propose_grasps
 from kitting_drake.hkd.importing.convex_cover import convex_cover
 from kitting_drake.hkd.importing.convex_decomposition import decompose
 from kitting_drake.hkd.importing.fit import HIGHEST_MM, THINNEST_MM
