@@ -111,13 +111,12 @@ class SteerableConv2d(ExpandedConv2d):
     """An equivariant convolution between fields (equation 3), in escnn's basis of kernels."""
 
     def _make_basis(self, in_fields: int, size: int) -> tuple[Tensor, int, float]:
-        basis = kernel_basis(self.in_fibre, self.out_fibre, size)
+        kind = torch.get_default_dtype()
+        basis, squares = _shared_basis(self.in_fibre, self.out_fibre, size, kind)
         # The samples of a field are correlated, because they are computed from fewer coefficients.
         repeated = self.in_fibre.channels / self.in_fibre.size
-        gathered = in_fields * float(basis.square().sum()) * repeated / self.out_fibre.channels
-        # Store the basis in the memory order that `expand_kernel` needs.
-        order = basis.permute(0, 1, 3, 4, 2).to(torch.get_default_dtype()).contiguous()
-        return order.permute(0, 1, 4, 2, 3), len(basis), math.sqrt(2 / gathered)
+        gathered = in_fields * squares * repeated / self.out_fibre.channels
+        return basis, len(basis), math.sqrt(2 / gathered)
 
     def kernel(self, dtype: torch.dtype = torch.float32) -> Tensor:
         return expand_kernel(self.weights, self.basis, dtype)
@@ -187,6 +186,21 @@ class PlainConv2d(nn.Conv2d):
         weight = self.weight.to(features.dtype)
         bias = None if self.bias is None else self.bias.to(features.dtype)
         return F.conv2d(features, weight, bias, padding=self.padding)
+
+
+@functools.lru_cache(maxsize=64)
+@torch.inference_mode(False)
+def _shared_basis(
+    in_fibre: Fibre, out_fibre: Fibre, size: int, dtype: torch.dtype
+) -> tuple[Tensor, float]:
+    """Returns the basis of all layers between two fibres, and the sum of its squares.
+
+    Returns:
+        (D, out channels, in channels, size, size), in the memory order that `expand_kernel` needs.
+    """
+    basis = kernel_basis(in_fibre, out_fibre, size)
+    order = basis.permute(0, 1, 3, 4, 2).to(dtype).contiguous()
+    return order.permute(0, 1, 4, 2, 3), float(basis.square().sum())
 
 
 @functools.lru_cache(maxsize=64)
