@@ -54,17 +54,36 @@ class Tree:
         """The external packages that each module imports."""
         for name, source in self.sources.items():
             self.imports[name], self.outside[name] = {}, set()
-            for imported, line in self._imported(name, source):
+            for imported, line in self._imported(name, _statements(source)):
                 if imported in self.files and imported != name:
                     self.imports[name].setdefault(imported, line)
                 elif imported not in self.files:
                     self.outside[name].add(imported.partition(".")[0])
 
-    def _imported(self, name: Module, source: ast.Module) -> Iterator[tuple[Module, int]]:
-        """All imports of a file, including those in functions and under TYPE_CHECKING."""
+    def loaded(self, *names: Module) -> set[str]:
+        """The external modules that importing some modules loads."""
+        outside: set[str] = set()
+        waiting, found = list(names), set()
+        while waiting:
+            name = waiting.pop()
+            if name in found:
+                continue
+            found.add(name)
+            waiting += [name.rpartition(".")[0]] if "." in name else []
+            for imported, _ in self._imported(name, _statements(self.sources[name], loaded=True)):
+                if imported in self.files:
+                    waiting.append(imported)
+                else:
+                    outside.add(imported)
+        return outside
+
+    def _imported(
+        self, name: Module, statements: Iterable[ast.AST]
+    ) -> Iterator[tuple[Module, int]]:
+        """The imports among the statements of a file."""
         is_package = self.files[name].name == "__init__.py"
         package = name.split(".") if is_package else name.split(".")[:-1]
-        for node in ast.walk(source):
+        for node in statements:
             if isinstance(node, ast.Import):
                 yield from ((alias.name, node.lineno) for alias in node.names)
             elif isinstance(node, ast.ImportFrom):
@@ -92,6 +111,27 @@ class Tree:
         if self.room(name) == "verbs":
             return "verbs"
         return str((path if path.name == "__init__.py" else path.parent).relative_to(ROOT))
+
+
+def _statements(node: ast.AST, *, loaded: bool = False) -> Iterator[ast.AST]:
+    """All statements below a node.
+
+    Args:
+        node: a module or a statement.
+        loaded: only those that importing the module runs: none in functions or for type checkers.
+    """
+    for child in ast.iter_child_nodes(node):
+        if not isinstance(child, ast.stmt | ast.ExceptHandler | ast.match_case):
+            continue
+        is_function = isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef)
+        if loaded and (is_function or _is_for_type_checkers(child)):
+            continue
+        yield child
+        yield from _statements(child, loaded=loaded)
+
+
+def _is_for_type_checkers(node: ast.AST) -> bool:
+    return isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)
 
 
 def _module(path: Path) -> Module:
@@ -156,6 +196,31 @@ def test_forbidden_external_imports(tree: Tree):
     assert not wrong, "\n".join(wrong)
 
 
+LAZY = {
+    "kitting_drake.run": {"torch", "escnn"},
+    "kitting_drake.evaluate": {"torch", "escnn"},
+    "kitting_drake.decide": {"pydrake", "torch", "escnn"},
+    "kitting_drake.demonstrate": {"pydrake", "torch", "escnn"},
+    "kitting_drake.gym": {"pydrake", "torch", "escnn"},
+    "kitting_drake.gym.environment": {"torch", "escnn"},
+    "kitting_drake.policies.matching.shape_matching": {"pydrake", "torch", "escnn"},
+}
+"""Packages that load slowly, or may be missing, and that these modules import when needed."""
+
+
+@pytest.mark.parametrize("name", LAZY)
+def test_lazy_imports(tree: Tree, name: Module):
+    loaded = {part for outside in tree.loaded(name) for part in outside.split(".")}
+    assert {"numpy", "gymnasium"} & loaded
+    assert not loaded & LAZY[name]
+
+
+def test_the_real_camera_loads_no_drake(tree: Tree):
+    modules = [name for name in tree.files if tree.room(name) == "real_camera"]
+    assert not any(outside.startswith("pydrake") for outside in tree.loaded(*modules))
+
+
+@pytest.mark.slow
 def test_the_real_camera_loads_without_drake(tree: Tree):
     modules = [name for name in tree.files if tree.room(name) == "real_camera"]
     program = f"import sys; sys.modules['pydrake'] = None; import {', '.join(modules)}"

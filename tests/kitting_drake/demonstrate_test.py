@@ -165,21 +165,19 @@ finally:
 """
 
 
-def test_the_command_needs_neither_drake_nor_torch(folder: Path):
+def test_the_command_needs_neither_drake_nor_torch(
+    folder: Path, verb: Callable[..., subprocess.CompletedProcess[str]]
+):
     """Invalid input prints one line and keeps the existing file."""
     output = folder.parent / "out"
     words = [folder, "--camera", folder.parent / "calibration.yaml", "--output", output]
-
-    def run() -> subprocess.CompletedProcess[str]:
-        arguments = [sys.executable, "-c", _NO_DRAKE, *map(str, words)]
-        return subprocess.run(arguments, cwd=ROOT, capture_output=True, text=True, timeout=300)
-
-    done = run()
+    arguments = [sys.executable, "-c", _NO_DRAKE, *map(str, words)]
+    done = subprocess.run(arguments, cwd=ROOT, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     assert "holds 2 demonstrations with 3 steps in all; 1 of them" in done.stdout
     assert done.stdout.endswith("False\n")
     (folder / "demo2" / "step1" / "action.json").unlink()
-    done = run()
+    done = verb("demonstrate", *words)
     assert done.returncode == 2
     assert done.stderr.startswith("error: ") and done.stderr.count("\n") == 1
     assert len(read_demonstrations(output / "demonstrations.h5").demonstrations) == 2

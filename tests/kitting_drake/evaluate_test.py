@@ -1,7 +1,6 @@
 import dataclasses
 import json
 import math
-import os
 import random
 import shutil
 import signal
@@ -178,13 +177,10 @@ def test_a_folder_in_use_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         evaluation.main()
 
 
-def die(chosen: ChosenScenario, seed: int, log: Path | None) -> None:
-    os.kill(os.getpid(), signal.SIGSEGV)
-
-
 def test_a_process_that_dies_leaves_a_failed_episode(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(evaluation, "_work", die)
-    lost = evaluation.run_in_worker(LocalWorkers(1), CHOSEN, 7)
+    workers = LocalWorkers(1)
+    monkeypatch.setattr(workers, "run", lambda *_: ProcessCrashed(-signal.SIGSEGV))
+    lost = evaluation.run_in_worker(workers, CHOSEN, 7)
     assert lost.keys() == {field.name for field in dataclasses.fields(EpisodeResult)}
     assert lost["seed"] == 7
     assert lost["success_rate"] == 0.0

@@ -60,13 +60,12 @@ OBJECT_KEYS = {
 }
 
 
-MORE_OF_THE_SAME = (
-    *("SevenTools", "TwelveTools", "FreshToolsets", "OwnToolsets", "Training"),
-    *("KittingSeenToolset", "TwoTools", "BlockInsertion", "PlaceRedInGreen", "StackBlockPyramid"),
-    *("PalletizingBoxes", "OneCamera30", "OneCamera60", "WristCamera"),
-    *("heap", "tray", "touching", "crossed", "TenLargeTools", "TwelveLargeTools", "Train"),
-)
-"""Suffixes of the names of scenarios that resemble others; these tests are slow."""
+ONE_OF_EACH_KIND = {
+    *("arranged:Arranged", "assembling_kits:Test", "kits:OneTool", "ravens:AlignBoxCorner"),
+    *("kitting_unseen:KittingUnseenToolsets", "kitting_unseen:ShapeMatching"),
+    *("raised_kits:Everything", "small_parts:RingsPlatesCylinders"),
+}
+"""The other scenarios have the same tasks and policies; their tests are slow."""
 
 
 def shipped() -> list[Any]:
@@ -76,9 +75,9 @@ def shipped() -> list[Any]:
             path,
             key.value,
             id=f"{path.stem}:{key.value}",
-            marks=[pytest.mark.slow]
-            if key.value.endswith(MORE_OF_THE_SAME) or path.parent.name == "paper"
-            else [],
+            marks=[]
+            if path.parent == SCENARIOS and f"{path.stem}:{key.value}" in ONE_OF_EACH_KIND
+            else [pytest.mark.slow],
         )
         for path in sorted(SCENARIOS.rglob("*.yaml"))
         for key, _ in yaml.compose(path.read_text(), Loader=yaml.SafeLoader).value
@@ -215,8 +214,8 @@ def test_errors_of_graphviz_are_reported(tmp_path: Path, monkeypatch):
         running.draw_diagram(builder.Build(), Path("cell.pdf"))
 
 
-def test_a_wrong_path_does_not_find_a_shipped_scenario(verb_process: Verb, tmp_path: Path):
-    done = verb_process("run", "no/such/kitting_oracle.yaml", "--no-meshcat", "--output", tmp_path)
+def test_a_wrong_path_does_not_find_a_shipped_scenario(verb: Verb, tmp_path: Path):
+    done = verb("run", "no/such/kitting_oracle.yaml", "--no-meshcat", "--output", tmp_path)
     assert done.returncode == 2
     assert "cannot read the scenario no/such/kitting_oracle.yaml" in done.stderr
 

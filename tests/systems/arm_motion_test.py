@@ -101,9 +101,9 @@ def check_random_ways(model: str, actions: int, seed: int) -> int:
     return ways
 
 
-@pytest.mark.parametrize("model", ["fr3", "panda"])
+@pytest.mark.parametrize("model", ["fr3", pytest.param("panda", marks=pytest.mark.slow)])
 def test_all_limits_hold_at_every_millisecond_also_when_stopped(model: str):
-    assert check_random_ways(model, actions=5, seed=3) > 20
+    assert check_random_ways(model, actions=3, seed=3) > 10
 
 
 @pytest.mark.slow
@@ -195,7 +195,7 @@ def test_joint_seven_stays_in_its_range_for_every_turn_of_an_object():
     for limits in (FR3, PANDA):
         motion = motion_of(limits)
         state = motion.view(motion.initial_state())
-        for pick_yaw in np.linspace(-3.1, 3.1, 9):
+        for pick_yaw in (-2.3, 0.8):
             for turn in np.linspace(-3.1, 3.1, 9):
                 set_action(state, (0.5, 0.2, pick_yaw), (0.5, -0.2, pick_yaw + turn))
                 assert motion.prepare(state), motion.reach_problem(state)

@@ -1,3 +1,4 @@
+import functools
 import itertools
 
 import numpy as np
@@ -18,6 +19,7 @@ SURFACES = SurfaceHeights(
 )
 
 
+@functools.cache
 def plan(model: str = "fr3", action: PickPlaceAction = ACTION, rate: int = 1000) -> ArmTrajectory:
     motion = ArmMotion(PARAMETERS, ARM_LIMITS[model], ArmBase())
     trajectory = plan_action(motion, PARAMETERS, action, SURFACES, rate=rate)
@@ -27,7 +29,11 @@ def plan(model: str = "fr3", action: PickPlaceAction = ACTION, rate: int = 1000)
 
 @pytest.mark.parametrize(
     ("model", "action", "rate"),
-    [("fr3", ACTION, 1000), ("panda", ACTION, 400), ("fr3", PRESS, 1000)],
+    [
+        ("fr3", ACTION, 1000),
+        pytest.param("panda", ACTION, 400, marks=pytest.mark.slow),
+        ("fr3", PRESS, 1000),
+    ],
 )
 def test_the_whole_action_keeps_all_limits(model: str, action: PickPlaceAction, rate: int):
     trajectory, limits = plan(model, action, rate), ARM_LIMITS[model]

@@ -35,7 +35,7 @@ NINE = [make_object(f"thing {number}", 0.5 + number) for number in range(9)]
         pytest.param(
             [make_episode(0, [1.0], timed_out=True)], PoseWithin(), 1, marks=pytest.mark.slow
         ),
-        ([make_lost_episode(0)], ADD_S, 1),
+        pytest.param([make_lost_episode(0)], ADD_S, 1, marks=pytest.mark.slow),
     ],
 )
 def test_draw_summary(

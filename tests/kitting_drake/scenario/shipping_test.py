@@ -126,7 +126,9 @@ def test_absolute_paths_are_made_relative(folder: Path, tmp_path: Path):
     ("name", "module", "place"),
     [
         pytest.param("policy_of_mine.py", "policy_of_mine", "where_i_run", marks=pytest.mark.slow),
-        ("policy_of_mine/__init__.py", "policy_of_mine", "where_i_run"),
+        pytest.param(
+            *("policy_of_mine/__init__.py", "policy_of_mine", "where_i_run"), marks=pytest.mark.slow
+        ),
         pytest.param(
             "policies_of_mine/policy.py",
             "policies_of_mine.policy",
@@ -153,6 +155,19 @@ def test_packs_the_users_policy(
     yaml.parent.mkdir(exist_ok=True)
     chosen = ChosenScenario(scenario, yaml, "mine", None)
     on_a_node(pack(chosen, folder), tmp_path / "node")
+
+
+def test_a_module_from_elsewhere_is_sent_with_the_rest(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    package = tmp_path / "where_i_run" / "policies_of_mine"
+    package.mkdir(parents=True)
+    (package / "policy.py").write_text("def act(observation): ...\n")
+    monkeypatch.syspath_prepend(package.parent)
+    scenario = Scenario(policy=PythonPolicy("policies_of_mine.policy:act"))
+    chosen = ChosenScenario(scenario, tmp_path / "mine.yaml", "mine", None)
+    sent = pack(chosen, folder).runtime_env["py_modules"]
+    assert [Path(module).name for module in sent] == ["policies_of_mine"]
 
 
 def test_a_missing_file_is_refused(folder: Path, tmp_path: Path):

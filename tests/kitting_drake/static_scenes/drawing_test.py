@@ -73,7 +73,7 @@ def scenes(tools: list[RandomTool]) -> list[StaticScene]:
     rng = np.random.default_rng(1)
     kit = static_scenes._draw_kit(tools, rng)
     return [
-        static_scenes._draw_scene(kit, tools, (), rng, seed).static_scene() for seed in range(6)
+        static_scenes._draw_scene(kit, tools, (), rng, seed).static_scene() for seed in range(4)
     ]
 
 

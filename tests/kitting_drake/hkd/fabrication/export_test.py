@@ -354,9 +354,9 @@ def test_a_kit_that_cannot_be_moved_into_place_keeps_the_old_one(
 
 
 def test_the_command_suggests_a_tool_name(
-    verb_process: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path
+    verb: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path
 ):
-    done = verb_process("hkd", "kit", "claw_hamer", "--output", tmp_path / "kit")
+    done = verb("hkd", "kit", "claw_hamer", "--output", tmp_path / "kit")
     assert done.returncode == 2
     assert done.stderr.strip().splitlines()[-1].endswith("did you mean 'claw_hammer'?")
 

@@ -19,8 +19,8 @@ def test_the_catalogue_lists_the_committed_tools():
     assert sorted(entry.name for entry in ENTRIES) == tool_names()
 
 
-# One tool of each category by default; all of them take a minute.
-QUICK = ["claw_hammer", "needle_nose_pliers", "angle_wrench", "phillips_screwdriver"]
+# Tools that are tested by default; all of them take a minute.
+QUICK = ["angle_wrench", "phillips_screwdriver"]
 
 
 def without_noise(sdf: bytes) -> str:

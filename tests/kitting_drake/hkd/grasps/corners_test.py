@@ -34,7 +34,9 @@ def polygon(sides: int, radius: float) -> Manifold:
     [
         # From a corner to the opposite side.
         (polygon(3, 34.0), 3, 0.051),
-        (polygon(5, 31.0), 5, 0.031 * (1 + math.cos(math.pi / 5))),
+        pytest.param(
+            *(polygon(5, 31.0), 5, 0.031 * (1 + math.cos(math.pi / 5))), marks=pytest.mark.slow
+        ),
         # A star, by two of its arms or by a point and the opposite notch.
         (star(5, 30.0, 14.0), 10, None),
     ],

@@ -13,7 +13,7 @@ def bar() -> trimesh.Trimesh:
 
 def ring() -> trimesh.Trimesh:
     """Its underside is bounded by two rims, one in the other."""
-    return trimesh.creation.annulus(60, 90, 12).subdivide_to_size(6.0)
+    return trimesh.creation.annulus(60, 90, 12).subdivide_to_size(12.0)
 
 
 def two_feet() -> trimesh.Trimesh:
@@ -28,7 +28,12 @@ def two_feet() -> trimesh.Trimesh:
 
 @pytest.mark.parametrize(
     ("shape", "wavy_mm", "inverted"),
-    [(bar, 0.8, False), (ring, 0.0, True), (ring, 0.8, False), (two_feet, 0.0, False)],
+    [
+        (bar, 0.8, False),
+        (ring, 0.0, True),
+        pytest.param(ring, 0.8, False, marks=pytest.mark.slow),
+        (two_feet, 0.0, False),
+    ],
 )
 def test_an_open_underside_is_closed_flat(
     shape: Callable[[], trimesh.Trimesh], wavy_mm: float, inverted: bool

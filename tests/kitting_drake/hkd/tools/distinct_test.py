@@ -44,7 +44,7 @@ def test_the_distance_of_a_tool_from_itself_is_small():
     assert mean_surface_distance(tool, tool) < 0.0005
 
 
-FAST = ("geologists_pick", "fencing_pliers")
+FAST = ("fencing_pliers",)
 
 
 @pytest.mark.parametrize(

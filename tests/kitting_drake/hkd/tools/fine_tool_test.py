@@ -44,7 +44,9 @@ def hulls_of(tool: Tool) -> list[np.ndarray]:
     "tool",
     [
         pytest.param(lambda: load_tool("flat_screwdriver"), id="screwdriver"),
-        pytest.param(lambda: load_tool("stubby_combination_wrench"), id="wrench"),
+        pytest.param(
+            lambda: load_tool("stubby_combination_wrench"), id="wrench", marks=pytest.mark.slow
+        ),
         pytest.param(lambda: scaled_tool(load_tool("tin_snips"), 0.3), id="scaled"),
         pytest.param(lambda: load_named("bracket_60x36x12"), id="part"),
     ],

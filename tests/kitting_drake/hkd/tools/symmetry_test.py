@@ -47,7 +47,7 @@ def triangles(solid: Manifold) -> NDArray[np.float64]:
         # A notch of half a millimetre is below the limits; one of 5 mm is not.
         (bar() - block(1, 4, 30).translate((90, 0, 0)), 2),
         (bar() - block(10, 4, 30).translate((90, 0, 0)), 1),
-        (prism(6, 60), 6),
+        pytest.param(prism(6, 60), 6, marks=pytest.mark.slow),
         pytest.param(prism(4, 60), 4, marks=pytest.mark.slow),
         pytest.param(prism(3, 60), 3, marks=pytest.mark.slow),
         (prism(128, 60), 24),

@@ -21,7 +21,7 @@ from kitting_drake.reproduction.benchmarks.trace_photos import (
 
 cv2 = pytest.importorskip("cv2")
 
-SMALL = (2000, 1500)
+SMALL, FINE = (1400, 1050), (2000, 1500)
 SPANNER = (
     CrossSection.square((110, 18)).translate((0, -9))
     + CrossSection.circle(17, 60)
@@ -50,7 +50,11 @@ def traced(path: Path, **request) -> TraceReport:
 
 @pytest.mark.parametrize(
     ("ground", "tilt", "height", "exif"),
-    [("dark", 22.0, 14.0, True), ("light", 8.0, 6.0, True), ("dark", 20.0, 14.0, False)],
+    [
+        ("dark", 22.0, 14.0, True),
+        pytest.param("light", 8.0, 6.0, True, marks=pytest.mark.slow),
+        pytest.param("dark", 20.0, 14.0, False, marks=pytest.mark.slow),
+    ],
 )
 def test_an_oblique_photo_gives_the_true_outline(
     ground: str, tilt: float, height: float, exif: bool, tmp_path: Path
@@ -77,7 +81,7 @@ def test_an_oblique_photo_gives_the_true_outline(
 
 def test_several_tools_are_numbered_from_the_left_and_have_heights_of_their_own(tmp_path: Path):
     bar = PlacedTool(CrossSection.square((20, 90)).translate((250, 60)), 25, ("red", "red"))
-    path = photo_of(tmp_path, spanner(8), bar, tilt=5)
+    path = photo_of(tmp_path, spanner(8), bar, tilt=5, size=FINE)
     report = traced(path, heights_mm=(8.0, 25.0), name="set")
     assert [tool.name for tool in report.tools] == ["set_1", "set_2"]
     assert report.tools[1].size_mm == pytest.approx((90, 20), abs=0.6)
@@ -86,7 +90,8 @@ def test_several_tools_are_numbered_from_the_left_and_have_heights_of_their_own(
 
 
 def test_a_tool_over_the_edge_of_the_sheet_is_not_cut_off_silently(tmp_path: Path):
-    path = photo_of(tmp_path, spanner(6, x=120, y=2), ground="light", tilt=3, shadow=0.2)
+    tool = spanner(6, x=120, y=2)
+    path = photo_of(tmp_path, tool, ground="light", tilt=3, shadow=0.2, size=FINE)
     with pytest.raises(UserError, match="over the sheet's edge"):
         traced(path, heights_mm=(6.0,))
 
@@ -104,7 +109,9 @@ def test_letter_is_told_from_a4(tmp_path: Path):
         ({"tilt": 36.0, "distance": 520.0}, "degrees from the vertical"),
         ({"blur": 9.0}, "blurred"),
         ({"sheet": (1500.0, 1200.0)}, "no sheet"),
-        ({"sheet": (210.0, 210.0)}, "sides of the largest sheet"),
+        pytest.param(
+            {"sheet": (210.0, 210.0)}, "sides of the largest sheet", marks=pytest.mark.slow
+        ),
     ],
 )
 def test_a_poor_photo_is_refused_in_a_sentence(spec: dict, reason: str, tmp_path: Path):

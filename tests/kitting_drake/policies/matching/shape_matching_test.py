@@ -2,8 +2,6 @@
 
 import dataclasses
 import math
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -21,7 +19,7 @@ from kitting_drake.policies.networks.weights import load_networks
 from kitting_drake.policies.stages import make_stages
 from kitting_drake.scenario.loader import load_scenario
 from systems.pick_place_parameters import PickPlaceParameters
-from systems.signals import Observation, PixelGrid, PlanarPose, fill_unseen
+from systems.signals import Observation, PlanarPose, fill_unseen
 from tests.kitting_drake.rig import build_rig
 
 pytestmark = pytest.mark.skipif(not can_render(), reason="images cannot be rendered here")
@@ -87,7 +85,7 @@ def test_places_a_tool_into_its_recess(seen):
 def test_avoids_failed_grasps(seen):
     observation, _ = seen
     tried = []
-    for _ in range(3):
+    for _ in range(2):
         action = ShapeMatchingPolicy(PLANNER)(observation, tried)
         assert not action.stop
         for pick in tried:
@@ -143,22 +141,28 @@ def test_an_object_that_fits_is_picked_even_if_the_networks_miss_it(seen):
         return dataclasses.replace(found, position=position, log_odds=-99.0)
 
     networks.predict_pick = blind
-    action = LearnedPolicy(networks, stages=FITTING)(observation)
+    action = LearnedPolicy(networks, orientations=36, stages=FITTING)(observation)
     assert not action.stop
     segmentation = segment(observation)
     fitting = [
         segmentation.objects[pair.item] for pair in match(segmentation, observation.grid.resolution)
     ]
     assert any(item.mask[pixel_of(observation, action)] for item in fitting)
-    assert LearnedPolicy(networks)(observation).stop
-    # After grasps of all objects failed everywhere, nothing is left.
+    assert LearnedPolicy(networks, orientations=36)(observation).stop
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seen", [None], indirect=True)
+def test_nothing_is_left_after_grasps_failed_everywhere(seen):
+    observation, _ = seen
     grid = observation.grid
     everywhere = [
         PlanarPose(*grid.to_world(pixel), 0.0)
         for region in segment(observation).objects
         for pixel in np.argwhere(region.mask)[::3]
     ]
-    assert LearnedPolicy(networks, stages=FITTING)(observation, everywhere).stop
+    policy = LearnedPolicy(load_networks(GENERALIST), orientations=36, stages=FITTING)
+    assert policy(observation, everywhere).stop
 
 
 @pytest.mark.parametrize("turn", [0.0, math.pi])
@@ -214,7 +218,7 @@ def test_a_grasp_without_room_moves_to_one_with_room(seen):
     def refined(pick, theta: float, failed=None):
         return refine_grasp(segmentation, pick, theta, grid.resolution, PLANNER, failed)
 
-    for index, (lies, _) in enumerate(true_places(scene)):
+    for index, (lies, _) in enumerate(true_places(scene)[:2]):
         grasp = scene.objects[index].grasps[0]
         pick = grid.to_pixel(rotation_matrix(lies[2]) @ (grasp.x, grasp.y) + lies[:2])
         theta = lies[2] + grasp.theta
@@ -259,15 +263,6 @@ def test_unseen_pixels_take_the_lowest_neighbouring_height():
     assert set(np.unique(filled)) == {np.float32(0.0), np.float32(0.05)}
 
 
-def test_does_not_import_torch():
-    code = (
-        "import sys, kitting_drake.policies.matching.shape_matching; print('torch' in sys.modules)"
-    )
-    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert out.stdout.strip() == "False"
-    assert PixelGrid() == Observation().grid
-
-
 @pytest.fixture(scope="module", params=[7402, pytest.param(7417, marks=pytest.mark.slow)])
 def kitted(request) -> Observation:
     """A kit with all of its tools, and four boxes on the table."""
@@ -292,7 +287,9 @@ def test_boxes_do_not_match_the_visible_parts_of_filled_recesses(kitted: Observa
     assert segmentation.recesses
     assert len(segmentation.objects) == 4
     policy = LearnedPolicy(
-        load_networks(GENERALIST), stages=make_stages(PLANNER, insertion=True, recover=True)
+        load_networks(GENERALIST),
+        orientations=36,
+        stages=make_stages(PLANNER, insertion=True, recover=True),
     )
     assert policy(kitted).stop
 

@@ -30,6 +30,7 @@ from tests.kitting_drake.real_camera.frames import calibration_of, cast, render_
 
 SCENARIO = Scenario()
 TRUE = calibration_of(SCENARIO)
+ONE = dataclasses.replace(TRUE, cameras=TRUE.cameras[:1])
 BLOCK = Block((0.20, 0.15, 0.05), (0.45, -0.2, 1.1))
 MODERATE = SensorNoiseParameters(depth_std=0.002, depth_step=0.001, flying_share=0.2)
 """The noise of `--perturb depth_noise:moderate`."""
@@ -84,7 +85,7 @@ def test_correct_cameras_pass(table: dict[str, Frame]):
     assert {line.verdict for line in findings(check)} == {"good"}
 
 
-@pytest.mark.parametrize("longer", [0.002, -0.002])
+@pytest.mark.parametrize("longer", [0.002, slow(-0.002)])
 def test_finds_a_depth_bias(table: dict[str, Frame], longer: float):
     check = check_cameras(noisy(table, longer), TRUE)
     for camera in check.cameras.values():
@@ -142,7 +143,7 @@ def test_a_block_shows_the_displacement_of_a_camera(size: tuple[float, float, fl
 @pytest.mark.parametrize("yaw", [slow(-0.5), 0.7, slow(1.2)])
 def test_a_square_block_is_never_off_by_a_quarter_turn(yaw: float):
     block = Block((0.16, 0.16, 0.05), (0.45, -0.2, yaw))
-    for camera in check_cameras(cast(TRUE, block), TRUE, block).cameras.values():
+    for camera in check_cameras(cast(ONE, block), ONE, block).cameras.values():
         assert math.degrees(offset(camera.block, block)[2]) == pytest.approx(0, abs=0.3)
 
 
@@ -154,7 +155,7 @@ def test_distortion_does_not_displace_the_block(pose: tuple[float, float, float]
         dataclasses.replace(
             item, intrinsics=dataclasses.replace(item.intrinsics, distortion=(-0.3, 0.1, 0, 0))
         )
-        for item in TRUE.cameras
+        for item in ONE.cameras
     )
     bent = Calibration(tuple(cameras), TRUE.grid)
     for camera in check_cameras(cast(bent, block), bent, block).cameras.values():
@@ -162,14 +163,14 @@ def test_distortion_does_not_displace_the_block(pose: tuple[float, float, float]
 
 
 def test_the_scale_distinguishes_depth_and_focal_length_errors():
-    frames = frames_of_block()
+    frames = {"front": frames_of_block()["front"]}
     stretched = {k: Frame(f.color, f.depth * np.float32(1.01)) for k, f in frames.items()}
-    check = check_cameras(stretched, TRUE, BLOCK)
+    check = check_cameras(stretched, ONE, BLOCK)
     assert scales(check.cameras["front"].block, BLOCK) == pytest.approx((1.01,) * 3, abs=0.004)
     assert "depth_scale" in _meaning(check, "scale")
     lens = dataclasses.replace(TRUE.cameras[0].intrinsics, focal=(445.5, 445.5))
     wrong = dataclasses.replace(
-        TRUE, cameras=(dataclasses.replace(TRUE.cameras[0], intrinsics=lens), *TRUE.cameras[1:])
+        TRUE, cameras=(dataclasses.replace(TRUE.cameras[0], intrinsics=lens),)
     )
     check = check_cameras(frames, wrong, BLOCK)
     length, width, height = scales(check.cameras["front"].block, BLOCK)
@@ -179,9 +180,9 @@ def test_the_scale_distinguishes_depth_and_focal_length_errors():
 
 def test_opposite_errors_of_two_focal_lengths_do_not_cancel():
     lens = dataclasses.replace(TRUE.cameras[0].intrinsics, focal=(459.0, 441.0))
-    cameras = (dataclasses.replace(TRUE.cameras[0], intrinsics=lens), *TRUE.cameras[1:])
+    cameras = (dataclasses.replace(TRUE.cameras[0], intrinsics=lens),)
     block = dataclasses.replace(BLOCK, pose=(0.45, -0.2, 0.0))
-    check = check_cameras(cast(TRUE, block), dataclasses.replace(TRUE, cameras=cameras), block)
+    check = check_cameras(cast(ONE, block), dataclasses.replace(TRUE, cameras=cameras), block)
     assert _line(check, "scale").verdict == BAD
 
 
@@ -191,7 +192,8 @@ def test_a_rotation_about_the_block_is_reported_as_an_offset():
     X = TRUE.cameras[0].X_BC.copy()
     X[:3, :3] = R @ X[:3, :3]
     X[:3, 3] = R @ (X[:3, 3] - (x, y, 0)) + (x, y, 0)
-    check = check_cameras(frames_of_block(), with_poses(TRUE, {"front": X}), BLOCK)
+    frames = {"front": frames_of_block()["front"]}
+    check = check_cameras(frames, with_poses(ONE, {"front": X}), BLOCK)
     assert np.hypot(*offset(check.cameras["front"].block, BLOCK)[:2]) < 5e-4
     # 2.6 mm at 10 cm from the block.
     assert _line(check, "offset").verdict == BAD

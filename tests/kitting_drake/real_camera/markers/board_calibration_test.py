@@ -113,12 +113,12 @@ def errors(found: NDArray, expected: NDArray) -> tuple[float, float]:
 @pytest.mark.parametrize(
     ("text", "tilt", "model", "values"),
     [
-        (CHARUCO, 0, "", ()),
+        pytest.param(CHARUCO, 0, "", (), marks=pytest.mark.slow),
         (CHARUCO, 15, "", BROWN),
-        (CHARUCO, 30, "", ()),
+        pytest.param(CHARUCO, 30, "", (), marks=pytest.mark.slow),
         (CHARUCO, 45, "equidistant", FISHEYE),
         (CHARUCO, 60, "", ()),
-        (APRILTAG, 5, "", ()),
+        pytest.param(APRILTAG, 5, "", (), marks=pytest.mark.slow),
         (APRILTAG, 40, "", BROWN),
     ],
 )

@@ -11,7 +11,7 @@ from tests.kitting_drake.rig import build_rig
 
 
 def test_phases_sum_to_their_episodes():
-    scenario = Scenario(cameras={}, time_limit=1.5)
+    scenario = Scenario(cameras={}, time_limit=1.0)
     stopwatch = PhaseStopwatch()
     simulated = wall = 0.0
     for seed in range(2):

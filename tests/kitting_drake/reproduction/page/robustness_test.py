@@ -1,5 +1,7 @@
 """The table of perturbations: each run goes into the row of its scenario."""
 
+import copy
+import functools
 from typing import Any
 
 import pytest
@@ -18,6 +20,12 @@ SAME = range(2870, 2895)
 """The common seeds of the first table's cells."""
 
 
+@functools.cache
+def resolved(perturb: str | None, tries: int) -> dict[str, Any]:
+    text = f"{{task: {{tries: {tries}}}}}"
+    return described(load_scenario(UNSEEN, text=text, perturb=perturb))
+
+
 def run(
     perturb: str | None,
     share: float,
@@ -26,14 +34,13 @@ def run(
     digest: str | None = None,
     **details: Any,
 ) -> Run:
-    scenario = load_scenario(UNSEEN, text=f"{{task: {{tries: {tries}}}}}", perturb=perturb)
     return Run(
         "some.json",
         {
             "policy": "shape_matching",
             "policy_digest": digest,
             "policy_details": {"method": "shape_matching", "recover": True} | details,
-            "resolved_scenario": described(scenario),
+            "resolved_scenario": copy.deepcopy(resolved(perturb, tries)),
             "strict_success_rate": share,
             "seeds": list(seeds),
             "episodes": len(seeds),

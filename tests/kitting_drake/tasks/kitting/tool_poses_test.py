@@ -77,7 +77,9 @@ def test_drawn_poses_of_twenty_seeds_are_free():
     assert max(yaws) > 120
 
 
-@pytest.mark.parametrize("count", [1, 7, pytest.param(12, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "count", [1, 4, *(pytest.param(many, marks=pytest.mark.slow) for many in (7, 12))]
+)
 def test_drawn_poses_of_any_number_of_tools_are_free(count: int):
     kit, tools = load(tuple(tool_names()[:: len(tool_names()) // 12][:count]))
     drawn = draw(kit, tools, 0)
