@@ -288,11 +288,12 @@ def test_a_process_killed_from_outside_is_retried_once(monkeypatch: pytest.Monke
         evaluation.run_in_worker(workers, CHOSEN, 7)
 
 
-def test_two_short_episodes_in_parallel(verb, tmp_path: Path):
+@pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_two_short_episodes(workers: int, verb, tmp_path: Path):
     done = verb(
         "evaluate",
         *("scenarios/kits.yaml", "--scenario_name", "OneTool"),
-        *("--episodes", 2, "--workers", 2, "--output", tmp_path),
+        *("--episodes", 2, "--workers", workers, "--output", tmp_path),
         *("--scenario_text", "{time_limit: 0.2}"),
     )
     assert done.returncode == 0, done.stderr

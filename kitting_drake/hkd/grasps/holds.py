@@ -112,11 +112,7 @@ def find_holds(
             used.
         corners: whether a corner may be held.
     """
-    fingers = centres[:, None] + np.arange(-FINGER_COLUMNS, FINGER_COLUMNS)
-    finger_left, finger_right = reach.left[fingers].max(axis=1), reach.right[fingers].min(axis=1)
-    extent = finger_left.max(axis=1) - finger_right.min(axis=1)
-    fit = (extent >= _NARROWEST) & (extent <= WIDEST + 2 * _FINGER_RECESS)
-    centres, finger_left, finger_right = centres[fit], finger_left[fit], finger_right[fit]
+    centres, finger_left, finger_right = _between_fingers(reach, centres)
     pads = centres[:, None] + np.arange(-_PAD_COLUMNS, _PAD_COLUMNS)
     left, right = reach.left[pads], reach.right[pads]
     occupied = np.isfinite(left).any(axis=1)
@@ -143,14 +139,13 @@ def find_holds(
     fit &= (contact >= _LEAST_CONTACT) | (corners & (width >= LEAST_WIDTH))
     for i in np.flatnonzero(fit):
         here = held[i]
-        faces = left[i][:, here], right[i][:, here]
-        slope = max(_lean(faces[0].max(axis=0), step), _lean(-faces[1].min(axis=0), step))
-        if slope > _STEEPEST:
+        one, other = left[i][:, here], right[i][:, here]
+        slope = max(_lean(one.max(axis=0), step), _lean(-other.min(axis=0), step))
+        at_corner = contact[i] < _LEAST_CONTACT
+        corner = corner_cost(one, other, BIN, touch) if at_corner else 0.0
+        if corner is None or slope > _STEEPEST:
             continue
-        corner = 0.0 if contact[i] >= _LEAST_CONTACT else corner_cost(*faces, BIN, touch)
-        if corner is None:
-            continue
-        depth, twist = _contact(touch_left[i][:, here], touch_right[i][:, here], corner > 0)
+        depth, twist = _contact(touch_left[i][:, here], touch_right[i][:, here], at_corner)
         yield (
             int(centres[i]),
             Hold(
@@ -165,6 +160,22 @@ def find_holds(
                 corner=corner,
             ),
         )
+
+
+def _between_fingers(
+    reach: Reach, centres: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], Array, Array]:
+    """Keeps the columns where the open fingers have room on both sides of the tool.
+
+    Returns:
+        The columns (n); and between the fingers the greatest and the least v at each level,
+        (n, levels) both.
+    """
+    fingers = centres[:, None] + np.arange(-FINGER_COLUMNS, FINGER_COLUMNS)
+    left, right = reach.left[fingers].max(axis=1), reach.right[fingers].min(axis=1)
+    extent = left.max(axis=1) - right.min(axis=1)
+    fit = (extent >= _NARROWEST) & (extent <= WIDEST + 2 * _FINGER_RECESS)
+    return centres[fit], left[fit], right[fit]
 
 
 def _contact(

@@ -135,7 +135,10 @@ def test_absolute_paths_are_made_relative(folder: Path, tmp_path: Path):
             "where_i_run",
             marks=pytest.mark.slow,
         ),
-        ("policies_of_mine/policy.py", "policies_of_mine.policy", "beside_the_scenario"),
+        pytest.param(
+            *("policies_of_mine/policy.py", "policies_of_mine.policy", "beside_the_scenario"),
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_packs_the_users_policy(

@@ -29,7 +29,7 @@ def two_feet() -> trimesh.Trimesh:
 @pytest.mark.parametrize(
     ("shape", "wavy_mm", "inverted"),
     [
-        (bar, 0.8, False),
+        pytest.param(bar, 0.8, False, marks=pytest.mark.slow),
         (ring, 0.0, True),
         pytest.param(ring, 0.8, False, marks=pytest.mark.slow),
         (two_feet, 0.0, False),

@@ -60,9 +60,9 @@ def test_the_deviation_of_a_complex_outline_is_reported(monkeypatch: pytest.Monk
     monkeypatch.setattr(convex_decomposition, "OUTLINE_TOLERANCES_MM", last)
     # A comb with gaps too wide to bridge.
     teeth = [
-        Manifold.cube((4, 30, 10)).translate((11.5 * index - 58.0, -40, 0)) for index in range(11)
+        Manifold.cube((4, 30, 10)).translate((11.5 * index - 71.0, -40, 0)) for index in range(13)
     ]
-    comb = Manifold.batch_boolean([Manifold.cube((128, 20, 10), True), *teeth], OpType.Add)
+    comb = Manifold.batch_boolean([Manifold.cube((152, 20, 10), True), *teeth], OpType.Add)
     found = decompose(comb.translate((0, 0, 5)), GRASP)
     assert len(found.hulls) > MOST_HULLS
     assert found.outline_deviation_mm == pytest.approx(1.0, abs=0.5)

@@ -221,7 +221,16 @@ def test_a_long_open_mesh_is_repaired_and_keeps_its_length(tmp_path: Path):
 
 
 def test_small_tools_keep_their_length(tmp_path: Path):
-    """A drive socket: round, hollow at both ends, with a hexagon and a square."""
+    bolt = Manifold.cube((25, 10, 8), True) + Manifold.cube((6, 16, 8), True).translate((9.5, 0, 0))
+    mesh = trimesh.Trimesh(*vertices_and_faces(bolt), process=False)
+    report = bring(exported(mesh, tmp_path / "bolt.stl"), tmp_path / "tools", material="steel")
+    assert report.record["length"] == pytest.approx(0.025, abs=1e-5)
+    assert report.record["mass"] == pytest.approx(7850e-9 * bolt.volume(), rel=1e-3)
+
+
+@pytest.mark.slow
+def test_a_drive_socket_keeps_its_length(tmp_path: Path):
+    """It is round and hollow at both ends, with a hexagon and a square."""
     socket = Manifold.cylinder(25, 11, circular_segments=48)
     socket -= Manifold.cylinder(14, 7.5, circular_segments=6).translate((0, 0, 12))
     socket -= Manifold.cube((9.6, 9.6, 10), True).translate((0, 0, 4))

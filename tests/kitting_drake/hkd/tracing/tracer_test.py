@@ -108,7 +108,7 @@ def test_letter_is_told_from_a4(tmp_path: Path):
     [
         ({"tilt": 36.0, "distance": 520.0}, "degrees from the vertical"),
         ({"blur": 9.0}, "blurred"),
-        ({"sheet": (1500.0, 1200.0)}, "no sheet"),
+        pytest.param({"sheet": (1500.0, 1200.0)}, "no sheet", marks=pytest.mark.slow),
         pytest.param(
             {"sheet": (210.0, 210.0)}, "sides of the largest sheet", marks=pytest.mark.slow
         ),

@@ -112,6 +112,7 @@ def losses(steps: int) -> list[dict[str, float]]:
     return found
 
 
+@pytest.mark.slow
 def test_learns_a_sample_reproducibly():
     found = losses(5)
     assert set(found[0]) == {"pick_position", "pick_angle", "place"}

@@ -86,6 +86,7 @@ def test_training_one_loss_alone_gives_the_same_weights():
     assert not torch.equal(expected["alpha.lift.weights"], before["alpha.lift.weights"])
 
 
+@pytest.mark.slow
 def test_a_prepared_draw_is_used_only_for_its_step_and_samples():
     samples, others = [scene(0), scene(1)], [scene(2)]
     one, other = trainer(), trainer()
