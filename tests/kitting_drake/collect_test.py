@@ -280,7 +280,7 @@ def test_a_scenario_without_cameras_is_refused(tmp_path: Path, monkeypatch: pyte
 def test_a_folder_in_use_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(ROOT)
     monkeypatch.setattr(sys, "argv", arguments(tmp_path))
-    with alone_in(tmp_path), pytest.raises(UserError, match="another process is at work"):
+    with alone_in(tmp_path), pytest.raises(UserError, match="another process is writing to"):
         collecting.main()
 
 

@@ -173,7 +173,7 @@ def test_a_folder_in_use_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     folder = tmp_path / "out"
     folder.mkdir()
     monkeypatch.setattr(sys, "argv", ["evaluate", str(scenario), "--output", str(folder)])
-    with alone_in(folder), pytest.raises(UserError, match="another process is at work"):
+    with alone_in(folder), pytest.raises(UserError, match="another process is writing to"):
         evaluation.main()
 
 

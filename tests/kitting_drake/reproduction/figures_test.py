@@ -210,7 +210,7 @@ def test_the_sentences_on_robustness(runs: dict[str, Summary]):
         objects = sum(row["objects"] for row in run["categories"].values())
         return f"{round(objects * run['strict_success_rate'])} of {objects}"
 
-    assert f"kitted {kitted('colours_and_lights_generalist')} unseen tools" in text
+    assert f"placed {kitted('colours_and_lights_generalist')} unseen tools" in text
     table = rows(page, "### Real meshes and laser scans")[2:]
     names = (
         "real_tools_generalist",
