@@ -224,7 +224,7 @@ def test_the_sentences_on_robustness(runs: dict[str, Summary]):
     lost = [runs[f"robust_all_generalist_{seed}"] for seed in (2870, 2900, 3500)]
     good, objects = counts(lost)
     assert (objects - good, objects) == (16, 300)
-    assert "lost sixteen tools of three hundred" in text
+    assert "failed on sixteen of three hundred tools" in text
     lost_rows = rows(page, "### What is lost")[2:]
     assert [row[0] for row in lost_rows] == ["10", "4", "1", "1"]
     causes: dict[str, int] = {
