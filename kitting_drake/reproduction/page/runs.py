@@ -35,6 +35,8 @@ _NOT_THE_TASK = ("policy", "random_seed", "target_realtime_rate", "meshcat")
 """The fields of a scenario in which runs of one task may differ."""
 
 _ADDED: dict[str, Any] = {
+    "task.kit.clearance_of": {},
+    "task.kit.stand_out": 0.0,
     "task.distractors": 0,
     "task.tries": 1,
     "task.pool": [],
