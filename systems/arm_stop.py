@@ -50,18 +50,27 @@ class ArmStop:
         if np.abs(v).max() < _RESTS and np.abs(a).max() < _RESTS:
             return
         jerk = _SHARE * np.array(limits.jerk)
-        mass = inertia.mass(q) if inertia else np.zeros((JOINTS, JOINTS))
         for _ in range(_TRIES):
             self._tabulate(_calculate(q, v, a, limits, jerk))
-            rate = np.abs(self._jerks() @ mass).max(axis=0) / limits.torque_rate
-            excess = float(rate.max()) / _SHARE
+            if inertia is None:
+                break
+            excess = float((self._torque_rates(inertia) / limits.torque_rate).max()) / _SHARE
             if excess <= 1.0:
                 break
             jerk = np.maximum(jerk / (1.02 * excess), 1.0)
 
-    def _jerks(self) -> NDArray[np.float64]:
-        """(n, 7) the constant jerk of each piece of the motion, in rad/s^3."""
-        return np.asarray(np.diff(self._states[:, 2], axis=0) / np.diff(self._times)[:, None])
+    def _torque_rates(self, inertia: ArmInertia) -> NDArray[np.float64]:
+        """(n, 7) largest rates of the torques M a near each switch, in N m/s: M j + M' a."""
+        lasts = np.diff(self._times)[:, None]
+        q, _, a = np.moveaxis(self._states, 1, 0)
+        jerk = np.diff(a, axis=0) / lasts
+        mass = np.array([inertia.mass(point) for point in q])
+        change = np.diff(mass, axis=0) / lasts[..., None]
+        ends = [
+            np.einsum("nij,nj->ni", mass[at], jerk) + np.einsum("nij,nj->ni", change, a[at])
+            for at in (slice(None, -1), slice(1, None))
+        ]
+        return np.maximum(*np.abs(ends))
 
     def _tabulate(self, found: ruckig.Trajectory) -> None:
         # Keep only plain numbers: Ruckig's objects report errors if they still exist when Python
