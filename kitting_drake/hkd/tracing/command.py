@@ -62,7 +62,11 @@ def describe_trace(tracer: argparse.ArgumentParser) -> None:
         help="also import the outlines as tools: one category for all, or one for each from left "
         "to right",
     )
-    scales = tracer.add_argument_group("scale without a sheet")
+    _describe_scales(tracer.add_argument_group("scale without a sheet"))
+    tracer.add_argument("--quiet", action="store_true", help="print nothing but errors")
+
+
+def _describe_scales(scales: "argparse._ArgumentGroup") -> None:
     scales.add_argument(
         "--scale_px",
         type=float,
@@ -94,7 +98,6 @@ def describe_trace(tracer: argparse.ArgumentParser) -> None:
         default="DICT_4X4_50",
         help="OpenCV's name of the board's marker dictionary (default: DICT_4X4_50)",
     )
-    tracer.add_argument("--quiet", action="store_true", help="print nothing but errors")
 
 
 def trace_photo(args: argparse.Namespace) -> None:

@@ -109,7 +109,7 @@ def _counts(
     yield from (option for option in options if option[0][0] * option[0][1] == fewest)
 
 
-def windows(side: float, room: float, count: int) -> list[tuple[float, float]]:
+def _windows(side: float, room: float, count: int) -> list[tuple[float, float]]:
     """The range of each cut, such that all pieces with their dovetails fit.
 
     Args:
@@ -187,7 +187,7 @@ class _Cutter:
         self, counts: tuple[int, int], price: NDArray[np.float64]
     ) -> tuple[list[Line], list[CrossSection], float]:
         length, width = self._size
-        down = [self._line(price, w, 0) for w in windows(length, self._bed[0], counts[0])]
+        down = [self._line(price, w, 0) for w in _windows(length, self._bed[0], counts[0])]
         edges = [np.array([(-9.0, 0.0), (-9.0, width)]), *(line for line, _ in down)]
         edges.append(np.array([(length + 9.0, 0.0), (length + 9.0, width)]))
         block = CrossSection.square(self._size)
@@ -199,7 +199,7 @@ class _Cutter:
             mask = self._mask(strip)
             across = [
                 self._line(np.where(mask, price, 0.01), w, 1)
-                for w in windows(width, self._bed[1], counts[1])
+                for w in _windows(width, self._bed[1], counts[1])
             ]
             cost += sum(value for _, value in across)
             sides = [np.array([(0.0, -9.0), (length, -9.0)]), *(line for line, _ in across)]
