@@ -244,5 +244,6 @@ def test_the_way_back_and_the_held_object_must_be_free_too():
 
     # Beside the hand's way, where the tool passes.
     assert "on the way to the place" in problem(Capsule((0.7, 0.0, 0.0), (0.7, 0.0, 0.07), 0.02))
+    assert problem(Capsule((0.8, 0.0, 0.0), (0.8, 0.0, 0.07), 0.02)) == ""
     # Only the retreat passes above the place.
     assert "home" in problem(Capsule((0.55, -0.3, 0.46), (0.55, -0.3, 0.48), 0.03))

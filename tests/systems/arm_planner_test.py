@@ -1,6 +1,7 @@
 """The planner with an arm that follows exactly."""
 
 import numpy as np
+import pytest
 from pydrake.common.value import Value
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, EventStatus, LeafSystem
@@ -122,3 +123,8 @@ def test_an_arm_does_what_it_can_reach_and_refuses_the_rest():
     # Nothing moves before the second action.
     moving = np.flatnonzero(np.abs(motions[:, 7:14]).max(axis=1) > 0)
     assert moving[0] / 128 > 0.2
+
+
+@pytest.mark.slow
+def test_a_rerun_is_equal():
+    np.testing.assert_array_equal(run()[2], run()[2])

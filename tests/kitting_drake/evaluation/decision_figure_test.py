@@ -44,8 +44,10 @@ def drawn(observation: Observation, decision: Decision) -> np.ndarray:
 def test_draw_decision_shows_the_decision(observation: Observation):
     picture = drawn(observation, decision(observation))
     assert picture.shape == (880, 1320, 3)
+    np.testing.assert_array_equal(picture, drawn(observation, decision(observation)))
     for other in (
-        decision(observation, theta=1.5, pick=(20.0, 12.0)),
+        decision(observation, theta=1.5),
+        decision(observation, pick=(20.0, 12.0)),
         dataclasses.replace(decision(observation), log_odds=3.0),
     ):
         assert (drawn(observation, other) != picture).any()

@@ -49,19 +49,18 @@ def traced(path: Path, **request) -> TraceReport:
 
 
 @pytest.mark.parametrize(
-    ("ground", "tilt", "height", "exif"),
+    ("ground", "tilt", "height", "exif", "size"),
     [
-        ("dark", 22.0, 14.0, True),
-        pytest.param("light", 8.0, 6.0, True, marks=pytest.mark.slow),
-        pytest.param("dark", 20.0, 14.0, False, marks=pytest.mark.slow),
+        ("dark", 22.0, 14.0, True, SMALL),
+        pytest.param("light", 8.0, 6.0, True, FINE, marks=pytest.mark.slow),
+        pytest.param("dark", 20.0, 14.0, False, FINE, marks=pytest.mark.slow),
     ],
 )
 def test_an_oblique_photo_gives_the_true_outline(
-    ground: str, tilt: float, height: float, exif: bool, tmp_path: Path
+    ground: str, tilt: float, height: float, exif: bool, size: tuple[int, int], tmp_path: Path
 ):
-    path = photo_of(
-        tmp_path, spanner(height), ground=ground, tilt=tilt, azimuth=130, roll=12, exif=exif
-    )
+    view = {"ground": ground, "tilt": tilt, "azimuth": 130, "roll": 12, "size": size}
+    path = photo_of(tmp_path, spanner(height), exif=exif, **view)
     report = traced(path, heights_mm=(height,))
     (tool,) = report.tools
     median, p95 = np.percentile(outline_errors(tool.outline, SPANNER), (50, 95))
