@@ -15,6 +15,7 @@ from kitting_drake.policies.matching.assignment import match
 from kitting_drake.policies.matching.refinement import refine_grasp, refine_place
 from kitting_drake.policies.matching.segmentation import segment
 from kitting_drake.policies.matching.shape_matching import ShapeMatchingPolicy
+from kitting_drake.policies.networks.factored import Networks
 from kitting_drake.policies.networks.weights import load_networks
 from kitting_drake.policies.stages import make_stages
 from kitting_drake.scenario.loader import load_scenario
@@ -128,9 +129,8 @@ def test_stops_when_nothing_is_left(seen):
     assert ShapeMatchingPolicy(PLANNER)(Observation()).stop
 
 
-@pytest.mark.parametrize("seen", [None], indirect=True)
-def test_an_object_that_fits_is_picked_even_if_the_networks_miss_it(seen):
-    observation, _ = seen
+def blind_networks() -> Networks:
+    """Networks that see nothing to pick, and prefer a corner."""
     networks = load_networks(GENERALIST)
     predict = networks.predict_pick
 
@@ -141,6 +141,13 @@ def test_an_object_that_fits_is_picked_even_if_the_networks_miss_it(seen):
         return dataclasses.replace(found, position=position, log_odds=-99.0)
 
     networks.predict_pick = blind
+    return networks
+
+
+@pytest.mark.parametrize("seen", [None], indirect=True)
+def test_an_object_that_fits_is_picked_even_if_the_networks_miss_it(seen):
+    observation, _ = seen
+    networks = blind_networks()
     action = LearnedPolicy(networks, orientations=36, stages=FITTING)(observation)
     assert not action.stop
     segmentation = segment(observation)
@@ -161,7 +168,7 @@ def test_nothing_is_left_after_grasps_failed_everywhere(seen):
         for region in segment(observation).objects
         for pixel in np.argwhere(region.mask)[::3]
     ]
-    policy = LearnedPolicy(load_networks(GENERALIST), orientations=36, stages=FITTING)
+    policy = LearnedPolicy(blind_networks(), orientations=36, stages=FITTING)
     assert policy(observation, everywhere).stop
 
 
