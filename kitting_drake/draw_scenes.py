@@ -59,7 +59,7 @@ def main() -> int:
     require_rendering()
     folder = require_folder(arguments.output)
     with alone_in(folder):
-        drawn_by = _drawn_by(arguments.random_views)
+        drawn_by = _drawn_by()
         identity = {"seed": arguments.seed, **drawn_by}
         claim_folder(folder, "settings.json", identity, of="set of scenes")
         path = folder / "scenes.h5"
@@ -76,11 +76,10 @@ def main() -> int:
     return 0
 
 
-def _drawn_by(random_views: bool = False) -> dict[str, str]:
-    """Returns the versions, sources, designs and cameras that determine the scenes of a seed."""
-    views = {"cameras": "random"} if random_views else {}
+def _drawn_by() -> dict[str, str]:
+    """Returns the versions, sources and designs that determine the scenes of a seed."""
     catalogue = hashlib.sha256(_CATALOGUE.read_bytes()).hexdigest()[:16]
-    return {**versions(), "code": source_digest(*_DRAWN_BY), "catalogue": catalogue, **views}
+    return {**versions(), "code": source_digest(*_DRAWN_BY), "catalogue": catalogue}
 
 
 class _Parts:
@@ -92,7 +91,7 @@ class _Parts:
         Args:
             folder: the folder of the files.
             seed: the seed of all draws.
-            drawn_by: the versions, sources, designs and cameras that determine the scenes.
+            drawn_by: the versions, sources and designs that determine the scenes.
 
         Raises:
             UserError: a file has another seed or version, or is damaged.
@@ -190,7 +189,7 @@ def _draw_part(path: Path, seed: int, drawn_by: dict[str, str]) -> int:
     scenes: list[StaticScene] = []
     counter = path.with_suffix(_DRAWN)
     try:
-        for scene in draw_batch(seed, random_views="cameras" in drawn_by):
+        for scene in draw_batch(seed):
             scenes.append(scene)
             counter.write_text(str(len(scenes)))
     finally:
@@ -225,11 +224,6 @@ def _parse() -> argparse.Namespace:
     )
     parser.add_argument("--scenes", type=count_type, default=3000, help="number of scenes (3000)")
     parser.add_argument("--seed", type=seed_type, default=0, help="seed of all draws (0)")
-    parser.add_argument(
-        "--random_views",
-        action="store_true",
-        help="one to three cameras at random poses, instead of the default ones",
-    )
     parser.add_argument(
         "--workers", type=count_type, help=f"number of parallel processes ({os.cpu_count()})"
     )

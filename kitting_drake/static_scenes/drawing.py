@@ -11,50 +11,43 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from manifold3d import CrossSection, Manifold
+from manifold3d import CrossSection
 from numpy.typing import NDArray
-from pydrake.common import MemoryFile
-from pydrake.geometry import (
-    ColorRenderCamera,
-    GeometryInstance,
-    InMemoryMesh,
-    Mesh,
-    PerceptionProperties,
-    RenderLabel,
-    SceneGraph,
-)
 from pydrake.math import RigidTransform, RollPitchYaw
-from pydrake.systems.framework import DiagramBuilder
-from pydrake.systems.sensors import RgbdSensor
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import MODELS
-from kitting_drake.common.rendering import add_observation_renderer, require_rendering
+from kitting_drake.common.rendering import require_rendering
 from kitting_drake.hkd.generation.catalogue import load_catalogue
 from kitting_drake.hkd.generation.random_tools import RandomTool, draw_tool
 from kitting_drake.hkd.kits.block import build_block
 from kitting_drake.hkd.kits.kit import Kit
 from kitting_drake.hkd.kits.layout import kit_cavities, layout_kit
 from kitting_drake.hkd.kits.parameters import KitParameters
-from kitting_drake.hkd.tools.meshes import flat_obj, vertices_and_faces
 from kitting_drake.policies.data.static_scenes import StaticScene
-from kitting_drake.scenario.cameras import Camera, camera_pose, depth_camera
+from kitting_drake.scenario.cameras import Camera
 from kitting_drake.scenario.schema import Scenario
 from kitting_drake.static_scenes.random_views import draw_views
+from kitting_drake.static_scenes.scene_images import (
+    Body,
+    block_text,
+    render,
+    solid_text,
+    tool_text,
+)
 from kitting_drake.tasks.footprints import OPEN_FINGERS
 from kitting_drake.tasks.kitting.convex_bodies import convex_body
+from kitting_drake.tasks.kitting.kit_stands import draw_stand
 from kitting_drake.tasks.kitting.start_groups import projected
 from kitting_drake.tasks.kitting.starts import draw_start, draw_unsettled
 from kitting_drake.tasks.kitting.tool_poses import (
-    DrawnBox,
     block_outline,
     draw_boxes,
     draw_poses,
     outline_at,
     rectangle_at,
 )
-from systems.heightmap_projector import HeightmapProjector
-from systems.sensor_noise import SensorNoise, SensorNoiseParameters
+from systems.sensor_noise import SensorNoiseParameters
 from systems.signals import Observation, PixelGrid
 
 _TOOLS_A_BATCH = 12
@@ -74,16 +67,18 @@ _MOST_STRANGERS, _MOST_BOXES = 2, 6
 """Largest numbers of other tools and of boxes in the clutter."""
 _STARTS = {"apart": 0.6, "touching": 0.28, "crossed": 0.04, "leaning": 0.04, "heap": 0.04}
 """Ways in which the loose tools lie, each with its share of the scenes."""
+_RAISED, _TILTED = 0.15, 0.15
+"""Shares of scenes whose kit stands on a riser, and whose kit is tilted."""
+_RISERS, _MOST_TILT_DEG = (0.01, 0.06), 5.0
+"""Range of the risers' heights in metres, and the largest tilt."""
 _FLAT, _ON_TABLE = np.cos(np.radians(2.0)), 0.001
 """A tool lies flat if the cosine of its tilt is above the first number, and its origin is closer to
 the table than the second, in metres."""
+_DEFAULT_VIEWS = 0.4
+"""Share of scenes that are seen by the default cameras of scenarios."""
 _WALL = 0.003
 _IN_CAVITY = 0.0008
 """Standard deviation of a seated tool's position in its cavity, in metres."""
-
-
-Body = tuple[str, RigidTransform]
-"""A mesh as Wavefront text in metres, and its pose in the world."""
 
 
 @dataclass(frozen=True)
@@ -111,27 +106,37 @@ class DrawnScene:
         """Renders the observation o_t with heights only."""
         return render(self.bodies, grid, self.noise, self.noise_seed, self.cameras)
 
-    def static_scene(self) -> StaticScene:
-        """Renders the scene and adds the labels for training."""
-        rows = []
-        for number, loose in enumerate(self.loose):
-            rows += _actions(number, loose)
-        return StaticScene.of(self.render(PixelGrid()), np.array(rows).reshape(-1, 8))
+    def static_scene(self) -> StaticScene | None:
+        """Renders the scene and adds the labels for training.
+
+        Only actions whose pick and place are in view have labels. Returns None if tools are loose
+        but no action has a label: such a scene is not final, and shows nothing to learn.
+        """
+        observation = self.render(PixelGrid())
+        rows = [row for number, loose in enumerate(self.loose) for row in _actions(number, loose)]
+        actions = np.array(rows).reshape(-1, 8)
+        seen = _in_view(observation, actions[:, 2:4]) & _in_view(observation, actions[:, 5:7])
+        actions = actions[seen]
+        if self.loose and not len(actions):
+            return None
+        return StaticScene.of(observation, actions)
 
 
-def draw_batch(seed: int, *, random_views: bool = False) -> Iterator[StaticScene]:
+def draw_batch(seed: int) -> Iterator[StaticScene]:
     """Draws the static scenes of a seed; see `draw_scenes`."""
-    for scene in draw_scenes(seed, random_views=random_views):
-        yield scene.static_scene()
+    for drawn in draw_scenes(seed):
+        scene = drawn.static_scene()
+        if scene is not None:
+            yield scene
 
 
-def draw_scenes(seed: int, *, random_views: bool = False) -> Iterator[DrawnScene]:
+def draw_scenes(seed: int, *, default_views: float = _DEFAULT_VIEWS) -> Iterator[DrawnScene]:
     """Draws the scenes of a seed.
 
     Args:
         seed: the seed of all draws. Different seeds share neither tools nor kits.
-        random_views: whether to use one to three cameras at random poses (`draw_views`) instead of
-            the default cameras.
+        default_views: the share of scenes that are seen by the default cameras. The others are seen
+            by one to three cameras at random poses (`draw_views`).
 
     Raises:
         MachineError: this machine cannot render.
@@ -156,10 +161,10 @@ def draw_scenes(seed: int, *, random_views: bool = False) -> Iterator[DrawnScene
                 own = np.random.SeedSequence([seed, 1, number, scene])
                 noise_seed = int(own.generate_state(1)[0])
                 drawn = _draw_scene(kit, chosen, others, rng, noise_seed)
-                if random_views:
-                    # Use a separate random stream, so that the views do not change the scenes.
-                    own = np.random.SeedSequence([seed, 2, number, scene])
-                    drawn = replace(drawn, cameras=draw_views(np.random.default_rng(own)))
+                # Use a separate random stream, so that the views do not change the scenes.
+                views = np.random.default_rng([seed, 2, number, scene])
+                if views.random() >= default_views:
+                    drawn = replace(drawn, cameras=draw_views(views))
                 yield drawn
         except UserError:
             # There is no room for these tools, so leave out the scene.
@@ -183,7 +188,7 @@ def _draw_kit(tools: Sequence[RandomTool], rng: np.random.Generator) -> _DrawnKi
     )
     layout = layout_kit(tools, parameters)
     block = build_block(kit_cavities(tools, layout.parameters, layout.poses), layout.parameters)
-    return _DrawnKit(Kit(Path("kit.sdf"), tuple(tools), layout), _solid_text(block))
+    return _DrawnKit(Kit(Path("kit.sdf"), tuple(tools), layout), solid_text(block))
 
 
 def _draw_scene(
@@ -206,27 +211,23 @@ def _draw_scene(
         strangers = [others[i] for i in rng.choice(len(others), count, replace=False)]
         box_count = int(rng.integers(0, _MOST_BOXES + 1))
     lying = [*(tools[index] for index in loose), *strangers]
-    X_WKit, X_WTools = draw_poses(
-        kit,
-        lying,
-        grid=grid,
-        spacing=float(rng.uniform(0.004, 0.02)),
-        yaw_range_deg=180.0,
-        rng=rng,
+    X_WLevel, X_WTools = _draw_poses(kit, lying, grid, rng)
+    stand = draw_stand(
+        list(_RISERS) if rng.random() < _RAISED else [0.0, 0.0],
+        [0.0, _MOST_TILT_DEG if rng.random() < _TILTED else 0.0],
+        rng,
     )
-    boxes = draw_boxes(box_count, [(kit, X_WKit)], lying, X_WTools, grid=grid, rng=rng)
-    X_WGoals = []
-    for index in range(len(tools)):
-        pose = kit.goal(index)
-        X_WGoals.append(
-            X_WKit @ RigidTransform(RollPitchYaw(0, 0, pose.yaw), [pose.x, pose.y, pose.z])
-        )
+    X_WKit = stand.lifted(kit, X_WLevel)
+    boxes = draw_boxes(box_count, [(kit, X_WLevel)], lying, X_WTools, grid=grid, rng=rng)
+    X_WGoals = [X_WKit @ _pose_in_kit(kit, index) for index in range(len(tools))]
     bodies = [(drawn.text, X_WKit)]
-    bodies += [(_text(tool), X) for tool, X in zip(lying, X_WTools, strict=True)]
+    if stand.riser:
+        bodies.append((block_text((*kit.size[:2], stand.riser)), X_WLevel))
+    bodies += [(tool_text(tool), X) for tool, X in zip(lying, X_WTools, strict=True)]
     for index in sorted(set(range(len(tools))) - set(loose)):
         dx, dy = np.clip(rng.normal(0, _IN_CAVITY, 2), -0.0015, 0.0015)
-        bodies.append((_text(tools[index]), RigidTransform([dx, dy, 0.0]) @ X_WGoals[index]))
-    bodies += [(_solid_text(_box(box)), box.X_WB) for box in boxes]
+        bodies.append((tool_text(tools[index]), RigidTransform([dx, dy, 0.0]) @ X_WGoals[index]))
+    bodies += [(block_text(box.size), box.X_WB) for box in boxes]
     noise = _draw_noise(rng)
 
     standing = [outline_at(block_outline(kit), X_WKit)]
@@ -238,6 +239,12 @@ def _draw_scene(
         found.append(LooseTool(tools[index], X_WTools[place], X_WGoals[index], around))
     cameras = dict(Scenario().cameras)
     return DrawnScene(tuple(bodies), tuple(found), cameras, noise, noise_seed)
+
+
+def _pose_in_kit(kit: Kit, index: int) -> RigidTransform:
+    """The pose of a seated tool in the kit's frame."""
+    pose = kit.goal(index)
+    return RigidTransform(RollPitchYaw(0, 0, pose.yaw), [pose.x, pose.y, pose.z])
 
 
 def _draw_poses(
@@ -318,6 +325,15 @@ def _actions(number: int, loose: LooseTool) -> list[tuple[float, ...]]:
     return rows
 
 
+def _in_view(observation: Observation, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """(n,) whether points (n, 2) of the world, in metres, lie in the view of a camera."""
+    shape = observation.in_view.shape
+    pixels = np.rint([observation.grid.to_pixel(point) for point in points]).reshape(-1, 2)
+    inside = ((pixels >= 0) & (pixels < shape)).all(axis=1)
+    row, column = np.clip(pixels, 0, np.array(shape) - 1).astype(int).T
+    return inside & observation.in_view[row, column]
+
+
 def _draw_noise(rng: np.random.Generator) -> SensorNoiseParameters:
     """Draws parameters of the camera noise, from none to that of a poor camera with a poor
     calibration."""
@@ -336,79 +352,3 @@ def _draw_noise(rng: np.random.Generator) -> SensorNoiseParameters:
         rig_position_error=float(0.004 * severity[6]),
         rig_angle_error_deg=float(0.4 * severity[7]),
     )
-
-
-def render(
-    bodies: Sequence[Body],
-    grid: PixelGrid,
-    noise: SensorNoiseParameters,
-    seed: int,
-    views: dict[str, Camera],
-) -> Observation:
-    """Renders the observation o_t of bodies on a table, with heights only; colours are black.
-
-    Args:
-        bodies: the bodies on the table, whose top is the plane z = 0.
-        grid: the pixels of the observation.
-        noise: the noise of the cameras.
-        seed: the seed of the noise.
-        views: the cameras by name.
-    """
-    builder = DiagramBuilder()
-    scene_graph = builder.AddSystem(SceneGraph())
-    source = scene_graph.RegisterSource("static")
-    renderer = add_observation_renderer(scene_graph)
-    corners = np.array([[-1, -2, 0], [2, -2, 0], [2, 2, 0], [-1, 2, 0]], float)
-    table = (_obj(corners, np.array([[0, 1, 2], [0, 2, 3]])), RigidTransform())
-    for number, (text, X) in enumerate([table, *bodies]):
-        file = MemoryFile(text, ".obj", f"body_{number}")
-        mesh = Mesh(InMemoryMesh(mesh_file=file))
-        instance = GeometryInstance(X, mesh, f"body_{number}")
-        properties = PerceptionProperties()
-        properties.AddProperty("label", "id", RenderLabel(number))
-        instance.set_perception_properties(properties)
-        scene_graph.RegisterAnchoredGeometry(source, instance)
-    cameras = {name: depth_camera(config, renderer) for name, config in views.items()}
-    projector = builder.AddSystem(HeightmapProjector(cameras=cameras, grid=grid))
-    for number, (name, config) in enumerate(views.items()):
-        sensor = builder.AddSystem(
-            RgbdSensor(
-                parent_id=scene_graph.world_frame_id(),
-                X_PB=camera_pose(config),
-                color_camera=ColorRenderCamera(cameras[name].core()),
-                depth_camera=cameras[name],
-            )
-        )
-        imperfect = builder.AddSystem(
-            SensorNoise(parameters=noise, camera=cameras[name], seed=seed, number=number)
-        )
-        builder.Connect(scene_graph.get_query_output_port(), sensor.query_object_input_port())
-        for output, port in (
-            ("depth_image_32f", "depth_image"),
-            ("body_pose_in_world", "body_pose_in_world"),
-        ):
-            builder.Connect(sensor.GetOutputPort(output), imperfect.GetInputPort(output))
-            builder.Connect(
-                imperfect.GetOutputPort(output), projector.GetInputPort(f"{port}_{name}")
-            )
-    builder.ExportOutput(projector.GetOutputPort("heights"), "heights")
-    diagram = builder.Build()
-    return diagram.GetOutputPort("heights").Eval(diagram.CreateDefaultContext())
-
-
-def _box(box: DrawnBox) -> Manifold:
-    return Manifold.cube(box.size, True).translate((0, 0, box.size[2] / 2))
-
-
-def _text(tool: RandomTool) -> str:
-    corners = tool.triangles.reshape(-1, 3)
-    return _obj(corners, np.arange(len(corners)).reshape(-1, 3))
-
-
-def _solid_text(solid: Manifold) -> str:
-    return _obj(*vertices_and_faces(solid))
-
-
-def _obj(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> str:
-    """A mesh as Wavefront text with face normals, which the renderer needs."""
-    return flat_obj(vertices, faces, digits=6, normal_digits=3)

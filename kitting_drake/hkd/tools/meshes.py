@@ -61,17 +61,25 @@ def flat_obj(
         digits: the number of decimals of the vertices.
         normal_digits: the number of decimals of the normals; None writes no normals.
     """
-    lines = [f"v {x:.{digits}f} {y:.{digits}f} {z:.{digits}f}" for x, y, z in vertices]
+    text = _rows(f"v %.{digits}f %.{digits}f %.{digits}f\n", vertices)
     if normal_digits is None:
-        lines += [f"f {i} {j} {k}" for i, j, k in faces + 1]
-    else:
-        a, b, c = np.moveaxis(vertices[faces], 1, 0)
-        normals = np.cross(b - a, c - a)
-        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
-        n = normal_digits
-        lines += [f"vn {x:.{n}f} {y:.{n}f} {z:.{n}f}" for x, y, z in normals]
-        lines += [f"f {i}//{n} {j}//{n} {k}//{n}" for n, (i, j, k) in enumerate(faces + 1, start=1)]
-    return "\n".join(lines) + "\n"
+        return text + _rows("f %d %d %d\n", faces + 1)
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
+    normals = np.cross(b - a, c - a)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    n = normal_digits
+    text += _rows(f"vn %.{n}f %.{n}f %.{n}f\n", normals)
+    numbers = np.arange(1, len(faces) + 1)
+    i, j, k = faces.T + 1
+    return text + _rows(
+        "f %d//%d %d//%d %d//%d\n", np.stack([i, numbers, j, numbers, k, numbers], axis=1)
+    )
+
+
+def _rows(line: str, values: np.ndarray) -> str:
+    """Formats each row of an array (n, m). One format operation for all rows is three times as fast
+    as one for each."""
+    return (line * len(values)) % tuple(values.ravel().tolist())
 
 
 def write_convex_obj(path: Path, points: np.ndarray) -> None:

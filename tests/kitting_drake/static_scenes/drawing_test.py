@@ -1,6 +1,7 @@
 """Tests of random tools, static scenes, and training samples from them."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,9 @@ from kitting_drake.policies.data.static_scenes import (
     write_static_scenes,
 )
 from kitting_drake.policies.data.training_data import read_training_data
+from kitting_drake.scenario.cameras import LookAt
 from kitting_drake.static_scenes import drawing as static_scenes
+from kitting_drake.tasks.kitting.tool_poses import outline_at
 from systems.signals import Observation, PixelGrid
 
 GRID = PixelGrid()
@@ -72,9 +75,10 @@ def scenes(tools: list[RandomTool]) -> list[StaticScene]:
         pytest.skip("images cannot be rendered here")
     rng = np.random.default_rng(1)
     kit = static_scenes._draw_kit(tools, rng)
-    return [
+    drawn = [
         static_scenes._draw_scene(kit, tools, (), rng, seed).static_scene() for seed in range(4)
     ]
+    return [scene for scene in drawn if scene is not None]
 
 
 def test_picks_are_on_tools_and_places_are_in_cavities(scenes: list[StaticScene]):
@@ -101,7 +105,7 @@ def test_an_action_moves_the_tool_into_a_cavity_of_its_shape(tools: list[RandomT
     free = 0
     while not free:
         scene = static_scenes._draw_scene(kit, tools, (), rng, 0).static_scene()
-        if len(np.unique(scene.actions[:, 0])) < 2:
+        if scene is None or len(np.unique(scene.actions[:, 0])) < 2:
             continue
         height = scene.image[3]
         block = np.percentile(height, 99)
@@ -117,6 +121,34 @@ def test_an_action_moves_the_tool_into_a_cavity_of_its_shape(tools: list[RandomT
                 if height[tuple(here)] > 0.004:
                     free += 1
                     assert height[tuple(there)] < block - 0.003
+
+
+@needs_renderer
+def test_loose_tools_touch_and_kits_stand_on_tilted_risers(
+    tools: list[RandomTool], monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(static_scenes, "_STARTS", {"touching": 1.0})
+    monkeypatch.setattr(static_scenes, "_RAISED", 1.0)
+    monkeypatch.setattr(static_scenes, "_TILTED", 1.0)
+    monkeypatch.setattr(static_scenes, "_draw_loose", lambda count, _: list(range(count)))
+    rng = np.random.default_rng(2)
+    kit = static_scenes._draw_kit(tools[:2], rng)
+    scene = static_scenes._draw_scene(kit, tools[:2], (), rng, 0)
+    one, other = (outline_at(item.tool.footprint, item.X_WT) for item in scene.loose)
+    assert (one ^ other).is_empty()
+    assert not (one.offset(0.0031) ^ other).is_empty()
+    X_WKit = scene.bodies[0][1]
+    assert 0.01 <= X_WKit.translation()[2] < 0.08
+    assert scene.loose[0].X_WGoal.rotation().matrix()[2, 2] < 1.0 - 1e-9
+
+
+@needs_renderer
+def test_what_no_camera_sees_has_no_label(tools: list[RandomTool]):
+    rng = np.random.default_rng(1)
+    scene = static_scenes._draw_scene(static_scenes._draw_kit(tools, rng), tools, (), rng, 0)
+    assert scene.loose
+    aside = LookAt(position=[0.5, 3.1, 1.0], target=[0.5, 3.0, 0.0])
+    assert replace(scene, cameras={"aside": aside}).static_scene() is None
 
 
 def test_scenes_are_unchanged_by_writing_and_reading(scenes: list[StaticScene], tmp_path: Path):
