@@ -92,6 +92,7 @@ def _settings(
         orientations=arguments.orientations,
         rotations=arguments.rotations,
         steps=arguments.steps,
+        batch=arguments.batch,
         learning_rate=arguments.learning_rate,
         decay=arguments.decay,
         taken_only=arguments.taken_only or not assumed.later_picks_possible,
@@ -274,6 +275,9 @@ def _add_settings(parser: argparse.ArgumentParser) -> None:
         "as many of the scene are used (default: the label's and four more, the minimum)",
     )
     parser.add_argument("--steps", type=count_type, default=10_000, help="(10000)")
+    parser.add_argument(
+        "--batch", type=count_type, default=1, metavar="N", help="number of samples in a step (1)"
+    )
     parser.add_argument(
         "--learning-rate", type=_rate_type, default=1e-4, help="learning rate of Adam (1e-4)"
     )

@@ -71,6 +71,7 @@ class Settings:
     rotations: int | None
     """The number of crop rotations in a training step, see `Networks.rotations`."""
     steps: int
+    batch: int
     learning_rate: float
     decay: bool
     taken_only: bool
@@ -165,6 +166,7 @@ class TrainingRun:
             networks,
             seed=settings.seed,
             steps=settings.steps,
+            batch=settings.batch,
             learning_rate=settings.learning_rate,
             decay=settings.decay,
             curvature=not settings.rigid,

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 from torch.optim.lr_scheduler import LambdaLR
 
 from kitting_drake.policies.data.images import Image, LabelledImage, Motion, Pictured, augment
@@ -23,7 +24,7 @@ _STOP_PROBABILITY = 1 / 8
 
 @dataclass(frozen=True)
 class _Draw:
-    """The random sample of a training step, in some steps with a final observation."""
+    """One random sample of a training step, sometimes with a final observation."""
 
     sample: LabelledImage
     random: np.random.Generator
@@ -36,15 +37,15 @@ class _Draw:
 
 @dataclass(frozen=True)
 class _Prepared:
-    """The sample for the next step, prepared in the background."""
+    """The samples of the next step, prepared in the background."""
 
     step: int
     samples: Sequence[LabelledImage]
     finals: Sequence[Pictured]
-    draw: Future[_Draw]
+    draws: Future[list[_Draw]]
 
     def of(self, samples: Sequence[LabelledImage], finals: Sequence[Pictured]) -> bool:
-        """Whether the sample was drawn from exactly these sequence objects."""
+        """Whether the samples were drawn from exactly these sequence objects."""
         return self.samples is samples and self.finals is finals
 
 
@@ -59,8 +60,8 @@ class Trainer:
     """Networks and their optimisers, one Adam per loss.
 
     All random draws of a step depend only on the seed and the step's number, so a resumed run
-    continues exactly. A thread prepares the next step's sample. The processes of torch's DataLoader
-    could not receive the samples, which refer to an open HDF5 file.
+    continues exactly. A thread prepares the samples of the next step. The processes of torch's
+    DataLoader could not receive them, because they refer to an open HDF5 file.
     """
 
     def __init__(
@@ -71,6 +72,7 @@ class Trainer:
         steps: int = 10_000,
         learning_rate: float = 1e-4,
         decay: bool = False,
+        batch: int = 1,
         curvature: bool = False,
         reflection: bool = False,
         only: str | None = None,
@@ -83,6 +85,7 @@ class Trainer:
             learning_rate: the learning rate of Adam.
             decay: whether the learning rate decays to zero (see `decayed`) instead of staying
                 constant.
+            batch: the number of samples in a step. Their losses are averaged.
             curvature: whether to augment by curvature, see `augment`.
             reflection: whether to augment by reflection, see `augment`.
             only: the name of the only loss to train; None trains all. The modules of other losses
@@ -93,6 +96,7 @@ class Trainer:
         self.steps = steps
         self.learning_rate = learning_rate
         self.decay = decay
+        self.batch = batch
         self.curvature = curvature
         self.reflection = reflection
         self.step_count = 0
@@ -127,9 +131,9 @@ class Trainer:
     def step(
         self, samples: Sequence[LabelledImage], finals: Sequence[Pictured] = ()
     ) -> dict[str, float]:
-        """Executes one training step on a random, augmented sample.
+        """Executes one training step on random, augmented samples.
 
-        In one of eight steps, on average, networks that can stop also learn from a final
+        With one of eight samples, on average, networks that can stop also learn from a final
         observation. Its loss is added to that of the picking module. The other modules are not
         affected.
 
@@ -138,46 +142,64 @@ class Trainer:
             finals: observations in which nothing is left to pick.
 
         Returns:
-            Each loss in nats. `stop` is present only in steps with a final observation.
+            The mean of each loss in nats. `stop` is present only in steps with a final observation.
         """
-        draw = self._take(samples, finals)
+        draws = self._take(samples, finals)
         self.networks.train()
-        values = {}
-        for name, loss_of in self.networks.losses(draw.sample, draw.random):
-            optimiser = self.optimisers.get(name)
-            if optimiser is None:
-                continue
+        for optimiser in self.optimisers.values():
             optimiser.zero_grad(set_to_none=True)
-            loss = loss_of()
-            loss.backward()
-            values[name] = float(loss.detach())
-            if name == self.networks.picking and draw.final is not None:
-                stop_loss = self.networks.stop_loss(draw.final, draw.stop_random)
-                stop_loss.backward()
-                values["stop"] = float(stop_loss.detach())
+        found: dict[str, list[float]] = {}
+        for draw in draws:
+            for name, value in self._learn(draw):
+                found.setdefault(name, []).append(value)
+        for optimiser in self.optimisers.values():
             optimiser.step()
         for schedule in self._schedules:
             schedule.step()
         self.step_count += 1
-        return values
+        return {name: sum(values) / len(values) for name, values in found.items()}
 
-    def _take(self, samples: Sequence[LabelledImage], finals: Sequence[Pictured]) -> _Draw:
-        """Returns the sample of this step, and starts to prepare that of the next step."""
+    def _learn(self, draw: _Draw) -> Iterator[tuple[str, float]]:
+        """Adds the gradients of a sample's losses; yields each loss."""
+        for name, loss_of in self.networks.losses(draw.sample, draw.random):
+            if name not in self.optimisers:
+                continue
+            yield name, self._backward(loss_of())
+            if name == self.networks.picking and draw.final is not None:
+                yield "stop", self._backward(self.networks.stop_loss(draw.final, draw.stop_random))
+
+    def _backward(self, loss: Tensor) -> float:
+        (loss / self.batch).backward()
+        return float(loss.detach())
+
+    def _take(self, samples: Sequence[LabelledImage], finals: Sequence[Pictured]) -> list[_Draw]:
+        """Returns the samples of this step, and starts to prepare those of the next step."""
         prepared = self._prepared
         if prepared and prepared.step == self.step_count and prepared.of(samples, finals):
-            draw = prepared.draw.result()
+            draws = prepared.draws.result()
         else:
-            draw = self._draw(self.step_count, samples, finals)
+            draws = self._draws(self.step_count, samples, finals)
         following = self.step_count + 1
-        future = self._thread.submit(self._draw, following, samples, finals)
+        future = self._thread.submit(self._draws, following, samples, finals)
         self._prepared = _Prepared(following, samples, finals, future)
-        return draw
+        return draws
+
+    def _draws(
+        self, step: int, samples: Sequence[LabelledImage], finals: Sequence[Pictured]
+    ) -> list[_Draw]:
+        return [self._draw(step * self.batch + i, samples, finals) for i in range(self.batch)]
 
     def _draw(
-        self, step: int, samples: Sequence[LabelledImage], finals: Sequence[Pictured]
+        self, number: int, samples: Sequence[LabelledImage], finals: Sequence[Pictured]
     ) -> _Draw:
-        """Draws and augments the sample of a step, and in some steps a final observation."""
-        random = np.random.default_rng([self.seed, step])
+        """Draws and augments a sample, and sometimes a final observation.
+
+        Args:
+            number: the number of the sample in the whole training.
+            samples: see `step`.
+            finals: see `step`.
+        """
+        random = np.random.default_rng([self.seed, number])
         sample = augment(
             samples[int(random.integers(len(samples)))],
             random,
@@ -185,7 +207,7 @@ class Trainer:
             reflection=self.reflection,
         )
         # A separate generator keeps the samples independent of the final observations.
-        stop_random = np.random.default_rng([self.seed, step, 1])
+        stop_random = np.random.default_rng([self.seed, number, 1])
         return _Draw(sample, random, self._draw_final(finals, stop_random), stop_random)
 
     def _draw_final(self, finals: Sequence[Pictured], random: np.random.Generator) -> Image | None:

@@ -73,6 +73,23 @@ def test_a_final_observation_only_affects_the_pick_position(
     assert changed == {"alpha"}
 
 
+def test_a_batch_averages_the_gradients_of_its_samples():
+    samples = [scene(0), scene(1)]
+
+    def gradients(learner: Trainer) -> list[torch.Tensor]:
+        losses.append(learner.step(samples))
+        return [weight.grad.clone() for weight in learner.networks.parameters()]
+
+    losses: list[dict[str, float]] = []
+    # The rate is so small that the weights do not change between the two steps.
+    single, both = trainer(learning_rate=1e-30), trainer(learning_rate=1e-30, batch=2)
+    expected = [(a + b) / 2 for a, b in zip(gradients(single), gradients(single), strict=True)]
+    for one, other in zip(gradients(both), expected, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-6)
+    for name, value in losses[2].items():
+        assert value == pytest.approx((losses[0][name] + losses[1][name]) / 2, rel=1e-5)
+
+
 def test_training_one_loss_alone_gives_the_same_weights():
     whole, alone = trainer(learning_rate=1e-3), trainer(learning_rate=1e-3, only="pick_angle")
     before = copy.deepcopy(alone.networks.state_dict())
