@@ -94,7 +94,7 @@ def annotate(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
 
 
 def import_mesh(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
-    """Makes a tool from a mesh (STL, OBJ, PLY, GLB, 3MF) or an outline (SVG, DXF)."""
+    """Makes a tool from a mesh (STL, OBJ, PLY, OFF, GLB, 3MF) or an outline (SVG, DXF)."""
     from kitting_drake.hkd.importing.importer import ImportRequest, import_tool
 
     console = Console(quiet=args.quiet, highlight=False, markup=False)
@@ -109,6 +109,7 @@ def import_mesh(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
         density=args.density,
         output=args.output,
         height_mm=args.height_mm,
+        frame=args.frame,
     )
     with Console(stderr=True, quiet=args.quiet).status(f"importing {escape(str(args.mesh))}"):
         report = import_tool(request)
@@ -323,6 +324,11 @@ def _describe_import(importer: argparse.ArgumentParser) -> None:
     )
     importer.add_argument(
         "--height_mm", type=float, help="the height in mm to which an outline is extruded"
+    )
+    importer.add_argument(
+        "--frame",
+        metavar="WHAT",
+        help="what a rectangle around the rest of an outline is: page or tool",
     )
     importer.add_argument("--mass_g", type=float, help="the weighed mass of the tool in grams")
     importer.add_argument(

@@ -9,6 +9,7 @@ from kitting_drake.hkd.importing.fit import HIGHEST_MM, THINNEST_MM, UNITS_MM
 from kitting_drake.hkd.importing.materials import DENSITY_RANGE, MATERIALS
 from kitting_drake.hkd.importing.outline import is_outline
 from kitting_drake.hkd.importing.reading import drawn_curves
+from kitting_drake.hkd.importing.reading.closed_curves import FRAMES
 from kitting_drake.hkd.importing.reading.mesh_files import IN_MM
 from kitting_drake.hkd.tools.tool import (
     LONGEST_MM,
@@ -41,6 +42,9 @@ class ImportRequest:
     """The folder of tools to write to; None: `user_tools`."""
     height_mm: float | None = None
     """The height in mm to which an outline is extruded. A mesh has none."""
+    frame: str | None = None
+    """What a rectangle around the rest of an outline is, one of `closed_curves.FRAMES`; None
+    judges, or asks."""
 
     @property
     def given_density(self) -> float | None:
@@ -68,6 +72,7 @@ def check_request(request: ImportRequest) -> None:
     for flag, name, names in (
         ("--unit", request.unit, units),
         ("--material", request.material, MATERIALS),
+        ("--frame", request.frame, FRAMES),
     ):
         if name is not None and name not in names:
             raise UserError(f"{flag} '{name}' is not known: give {', '.join(names)}")
@@ -81,6 +86,8 @@ def check_request(request: ImportRequest) -> None:
         raise UserError(f"{request.mesh} is an outline: give the tool's height with --height_mm")
     if not is_outline(request.mesh) and request.height_mm is not None:
         raise UserError(f"--height_mm is for outlines (SVG, DXF), and {request.mesh} is a mesh")
+    if not is_outline(request.mesh) and request.frame is not None:
+        raise UserError(f"--frame is for outlines (SVG, DXF), and {request.mesh} is a mesh")
 
 
 def checked_name(request: ImportRequest) -> str:

@@ -37,7 +37,7 @@ def is_outline(path: Path) -> bool:
     return path.suffix.lower() in OUTLINE_FORMATS
 
 
-def read_drawing(path: Path, unit_mm: float | None = None) -> Drawing:
+def read_drawing(path: Path, unit_mm: float | None = None, frame: str | None = None) -> Drawing:
     """Reads the outline in a drawing: the area inside its largest closed curve, less its holes.
 
     A page or frame around the outline is left out, and curves that are drawn twice count once.
@@ -47,6 +47,7 @@ def read_drawing(path: Path, unit_mm: float | None = None) -> Drawing:
         path: the path of the drawing.
         unit_mm: the length in mm of a unit of the drawing; None takes the unit from the file (see
             `svg_curves` and `dxf_curves`).
+        frame: what a rectangle around all else is, `page` or `tool`; None judges, or asks.
 
     Raises:
         UserError: the file is missing or not a drawing, its size is unknown, a curve is open, or
@@ -66,7 +67,7 @@ def read_drawing(path: Path, unit_mm: float | None = None) -> Drawing:
     good = [c for c in drawn.curves if len(c.points) > 1 and np.isfinite(c.points).all()]
     if not good:
         raise UserError(f"{path} has no curves: convert text and pictures to paths first")
-    outline, notes = enclosed(dataclasses.replace(drawn, curves=good), path)
+    outline, notes = enclosed(dataclasses.replace(drawn, curves=good), path, frame)
     return Drawing(outline, drawn.measured, [*drawn.notes, *notes])
 
 

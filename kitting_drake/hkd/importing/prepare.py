@@ -151,12 +151,12 @@ def _surface(request: ImportRequest) -> tuple[np.ndarray, np.ndarray, list[str]]
     assert request.height_mm is not None
     unit_mm = None if request.unit is None else drawn_curves.UNITS_MM[request.unit]
     try:
-        drawing = read_drawing(request.mesh, unit_mm)
+        drawing = read_drawing(request.mesh, unit_mm, request.frame)
     except UserError:
         # The unit does not matter for a drawing that is scaled to a given length.
         if request.length_mm is None or unit_mm is not None:
             raise
-        drawing = read_drawing(request.mesh, 1.0)
+        drawing = read_drawing(request.mesh, 1.0, request.frame)
     outline = laid_along_x(drawing.outline, request.length_mm, str(request.mesh))
     measured = f"measured {drawing.measured}"
     if request.length_mm is not None:

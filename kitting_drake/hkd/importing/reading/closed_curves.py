@@ -1,5 +1,6 @@
 """Joins the curves of a drawing into the outline of one tool."""
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -24,35 +25,87 @@ PAPERS_MM = (
 
 _JOIN_MM = 0.1
 """The largest gap between the ends of two curves that are joined, in mm."""
+_POINT_MM = 0.002
+"""A smaller curve is a point."""
 _SAME_MM = 0.05
 """The distance in mm within which a curve counts as a second drawing of another."""
 _LEAST_AREA_MM2 = 1.0
 _LINE_MM = 1.5
 """The width in mm below which two outlines count as the two sides of one thick line."""
-# A rectangle counts as a page or frame if its sides are at least `_PAGE` times the page's, and the
-# next largest curve is at least `_SPANS` times as long as the rectangle.
-_PAGE, _SPANS = 0.85, 0.4
+FRAMES = ("page", "tool")
+"""What a rectangle around the rest of a drawing may be."""
+
+_BOX = 0.9
+"""A rectangle, also one with round corners, fills at least this share of its bounds."""
+_THE_PAGE, _PAGE = "the page", 0.85
+"""The page's rectangle has at least this share of its sides."""
+# A rectangle around a curve as long as the second share of it is a frame if that curve has holes.
+# A curve shorter than the first share of it is a hole. Others are a question.
+_SHORT, _LONG = 0.25, 0.4
+_ROUND = 0.02
+"""The largest difference of a round hole from a circle."""
 
 Points = NDArray[np.float64]
 
 
-def enclosed(drawn: DrawnCurves, path: Path) -> tuple[CrossSection, list[str]]:
+@dataclass(frozen=True)
+class _Loop:
+    """A closed curve."""
+
+    area: CrossSection
+    element: int | None
+    """As of `Curve`."""
+
+    @property
+    def size(self) -> Points:
+        """Its sides along x and y."""
+        x_min, y_min, x_max, y_max = self.area.bounds()
+        return np.array([x_max - x_min, y_max - y_min])
+
+    @property
+    def is_round(self) -> bool:
+        """Whether it is a circle."""
+        across = self.size.mean()
+        square = abs(self.size[0] - self.size[1]) < _ROUND * across
+        return bool(square and abs(self.area.area() / (np.pi / 4 * across**2) - 1) < _ROUND)
+
+    def holds(self, other: "_Loop") -> bool:
+        """Whether another curve lies inside it."""
+        return bool((other.area - self.area).area() < 0.01 * other.area.area())
+
+
+def enclosed(
+    drawn: DrawnCurves, path: Path, frame: str | None = None
+) -> tuple[CrossSection, list[str]]:
     """Returns the area inside the largest closed curve and outside the others, and notes.
 
+    Args:
+        drawn: the curves.
+        path: the drawing, for messages.
+        frame: one of `FRAMES`; None judges a rectangle around all else.
+
     Raises:
-        UserError: a curve is open, crosses itself, or is not inside the largest curve.
+        UserError: a curve is open, or crosses itself, or is not inside the largest one, or that may
+            be a frame.
     """
     notes: list[str] = []
-    areas = [CrossSection([loop], FillRule.EvenOdd) for loop in _joined(drawn, path, notes)]
-    areas.sort(key=lambda area: -area.area())
-    while len(areas) > 1 and (frame := _as_frame(areas, drawn.page_mm)):
-        notes.append(f"left out {frame} around it")
-        areas.pop(0)
+    loops = [
+        _Loop(CrossSection([points], FillRule.EvenOdd), element)
+        for points, element in _joined(drawn, path, notes)
+    ]
+    loops.sort(key=lambda loop: -loop.area.area())
+    while len(loops) > 1 and (left_out := _as_frame(loops, drawn.page_mm, path, frame)):
+        notes.append(f"left out {left_out} around it")
+        loops.pop(0)
+    areas = [loop.area for loop in loops]
     if not areas or areas[0].area() < _LEAST_AREA_MM2:
         raise UserError(f"{path} has no closed curve that encloses an area")
     outer, *holes = areas
-    if len(outer.decompose()) > 1:
+    parts = sorted(outer.decompose(), key=lambda part: -part.area())
+    if sum(part.area() for part in parts[1:]) > _LEAST_AREA_MM2:
         raise UserError(f"{path}: its outline crosses itself")
+    # Lines that overshoot a corner leave specks.
+    outer = parts[0]
     for hole in holes:
         if (hole - outer).area() > 0.01 * hole.area():
             raise UserError(
@@ -70,69 +123,115 @@ def enclosed(drawn: DrawnCurves, path: Path) -> tuple[CrossSection, list[str]]:
     return outer.simplify(FLAT_MM), notes
 
 
-def _as_frame(areas: list[CrossSection], page_mm: tuple[float, float] | None) -> str | None:
-    """Describes the largest area if it is a page or a frame; returns None if it is the tool itself.
+def _as_frame(
+    loops: list[_Loop], page_mm: tuple[float, float] | None, path: Path, frame: str | None
+) -> str | None:
+    """Describes the largest curve if it is a page or a frame; None if it is the tool itself.
 
     Args:
-        areas: the areas inside closed curves, the largest first; at least two.
-        page_mm: the size of the page, if the drawing has one.
+        loops: closed curves, the largest first; at least two.
+        page_mm: the size of the page, where the drawing has one.
+        path: the drawing, for messages.
+        frame: as of `enclosed`.
+
+    Raises:
+        UserError: it may be either.
     """
-    area, inside, *others = areas
-    x_min, y_min, x_max, y_max = area.bounds()
-    sides = np.array([x_max - x_min, y_max - y_min])
-    low = inside.bounds()
-    spans = max(low[2] - low[0], low[3] - low[1]) >= _SPANS * sides.max()
-    if area.area() < 0.999 * sides.prod() or not spans or area.area() < 1.02 * inside.area():
+    box, inside, *others = loops
+    sides = box.size
+    if (
+        frame == "tool"
+        or box.area.area() < _BOX * sides.prod()
+        # The rectangle drawn twice, or the inner side of its line.
+        or box.area.area() < 1.02 * inside.area.area()
+        or (box.area.offset(-_LINE_MM, JoinType.Miter) - inside.area).area()
+        < 0.001 * box.area.area()
+        or not all(box.holds(other) for other in loops[1:])
+    ):
         return None
     size = f"a rectangle of {sides[0]:.0f} x {sides[1]:.0f} mm"
-    share = np.array([0.0, 0.0]) if page_mm is None else sides / page_mm
+    page = _page_of(sides, page_mm)
+    if frame == "page":
+        return f"{size}, {page or 'a frame'},"
+    # A filled element shows its inner curves as holes.
+    if inside.element is not None and inside.element == box.element:
+        return None
+    share = float(inside.size.max() / sides.max())
+    has_holes = any(
+        other.area.area() < 0.98 * inside.area.area() and inside.holds(other) for other in others
+    )
+    if sides.max() > LONGEST_MM:
+        return f"{size}, {page or 'a frame'}," if share >= _LONG else None
+    # Lines as large as the page may be those of a tool that the page was fitted to.
+    is_ground = page is not None and (
+        page != _THE_PAGE or None not in (box.element, inside.element)
+    )
+    if share >= _LONG and (has_holes or (is_ground and not inside.is_round)):
+        return f"{size}, {page or 'a frame'},"
+    if share < _SHORT or inside.is_round:
+        return None
+    inner = f"{inside.size[0]:.0f} x {inside.size[1]:.0f} mm"
+    raise UserError(
+        f"{path} has {size} around a curve of {inner}: give --frame page if the tool is what is "
+        "inside, or --frame tool if it is the rectangle, with a hole"
+    )
+
+
+def _page_of(sides: Points, page_mm: tuple[float, float] | None) -> str | None:
+    """Which page is as large as a rectangle, if one is."""
+    share = np.zeros(2) if page_mm is None else sides / page_mm
     if ((share >= _PAGE) & (share <= 1 / _PAGE)).all():
-        return f"{size}, the page,"
+        return _THE_PAGE
     for name, short, long in PAPERS_MM:
         if np.abs(np.sort(sides) - (short, long)).max() < 1.0:
-            return f"{size}, a sheet of {name},"
-    # A hole contains no other hole, but the tool in a frame may have one.
-    edge = (area.offset(-_LINE_MM, JoinType.Miter) - inside).area() < 0.001 * area.area()
-    holed = any(
-        other.area() < 0.98 * inside.area() and (other - inside).area() < 0.01 * other.area()
-        for other in others
-    )
-    return f"{size}, a frame," if sides.max() > LONGEST_MM or (holed and not edge) else None
+            return f"a sheet of {name}"
+    return None
 
 
-def _joined(drawn: DrawnCurves, path: Path, notes: list[str]) -> list[Points]:
-    """Joins curves whose ends meet into closed curves.
+def _joined(drawn: DrawnCurves, path: Path, notes: list[str]) -> list[tuple[Points, int | None]]:
+    """Joins curves whose ends meet into closed curves; with the element of each.
 
     Raises:
         UserError: a curve stays open.
     """
     # Drop the single points that some programs leave behind.
-    curves = [curve for curve in drawn.curves if np.ptp(curve.points, axis=0).max() > _JOIN_MM]
+    curves = [curve for curve in drawn.curves if np.ptp(curve.points, axis=0).max() > _POINT_MM]
     drawn_once = _merged_lines(curves)
     drawn_once = [drawn_once[k] for k in _without_doubles([c.points for c in drawn_once])]
     if len(drawn_once) < len(curves):
         notes.append(f"left out {len(curves) - len(drawn_once)} curves that are drawn twice")
     curves = drawn_once
-    loops = [curve.points for curve in curves if _is_closed(curve.points)]
-    chains = [(curve.points, curve.filled) for curve in curves if not _is_closed(curve.points)]
-    while chains:
-        chain, filled = chains.pop()
-        while not _is_closed(chain) and chains:
-            ends = np.array([(other[0], other[-1]) for other, _ in chains])
-            gaps = np.linalg.norm(ends - chain[-1], axis=2)
-            index, end = np.unravel_index(int(np.argmin(gaps)), gaps.shape)
+    loops = [(curve.points, curve.element) for curve in curves if _is_closed(curve.points)]
+    chains = [curve for curve in curves if not _is_closed(curve.points)]
+    ends = np.array([curve.points[[0, -1]] for curve in chains]).reshape(-1, 2, 2)
+    waiting = np.ones(len(chains), dtype=bool)
+    while waiting.any():
+        index = int(np.flatnonzero(waiting)[-1])
+        waiting[index] = False
+        first = chains[index]
+        chain, filled = first.points, first.filled
+        parts = [chain]
+        while not _is_closed(chain) and waiting.any():
+            gaps = np.linalg.norm(ends - parts[-1][-1], axis=2)
+            gaps[~waiting] = np.inf
+            index, end = (int(k) for k in np.unravel_index(int(np.argmin(gaps)), gaps.shape))
             if gaps[index, end] > _JOIN_MM:
                 break
-            other, other_filled = chains.pop(int(index))
-            filled = filled and other_filled
-            chain = np.concatenate([chain, other if end == 0 else other[::-1]])
+            waiting[index] = False
+            filled = filled and chains[index].filled
+            parts.append(chains[index].points[:: 1 if end == 0 else -1])
+            chain = np.concatenate(parts)
         if not _is_closed(chain):
+            if np.ptp(chain, axis=0).max() <= 2 * _JOIN_MM:
+                # Left over where other pieces met.
+                continue
             area = abs(CrossSection([chain], FillRule.EvenOdd).area())
             if not filled or area < _LEAST_AREA_MM2:
-                raise _gap_error([chain, *(other for other, _ in chains)], drawn, path)
+                rest = [chains[k].points for k in np.flatnonzero(waiting)]
+                raise _gap_error([chain, *rest], drawn, path)
             gap = float(np.linalg.norm(chain[-1] - chain[0]))
             notes.append(f"closed a filled curve straight over a gap of {gap:.2f} mm")
-        loops.append(chain)
+        loops.append((chain, first.element))
     return loops
 
 
@@ -200,9 +299,10 @@ def _without_doubles(curves: list[Points]) -> list[int]:
         for other in around[within.all(axis=1)]:
             if other not in trees:
                 trees[other] = cKDTree(_dense(curves[other], _SAME_MM))
-            # The nearest place may lie between two of the dense points, so allow a little more than
-            # `_SAME_MM`.
-            if trees[other].query(places)[0].max() <= 1.2 * _SAME_MM:
+            # Half a step of the dense points is added to the distance. A short piece of a curve
+            # is close to its neighbours.
+            near = min(1.2 * _SAME_MM, 0.5 * _SAME_MM + 0.2 * lengths[index])
+            if trees[other].query(places)[0].max() <= near:
                 break
         else:
             kept.append(int(index))
@@ -220,4 +320,8 @@ def _dense(curve: Points, step: float) -> Points:
 
 
 def _is_closed(curve: Points) -> bool:
-    return len(curve) > 2 and bool(np.linalg.norm(curve[-1] - curve[0]) <= _JOIN_MM)
+    if len(curve) < 3:
+        return False
+    gap = float(np.linalg.norm(curve[-1] - curve[0]))
+    # A short piece of a curve ends near its start, too.
+    return gap <= min(_JOIN_MM, 0.3 * float(np.ptp(curve, axis=0).max()))

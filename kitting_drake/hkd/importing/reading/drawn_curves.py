@@ -27,6 +27,8 @@ class Curve:
     """Points (n, 2) in mm, with y up."""
     filled: bool = False
     """Whether the drawing fills the curve. A filled curve looks closed even if it is open."""
+    element: int | None = None
+    """The number of the filled element that it is a part of, so that others of it are holes."""
 
 
 @dataclass(frozen=True)

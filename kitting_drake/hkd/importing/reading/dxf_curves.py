@@ -1,5 +1,6 @@
 """Reads the curves of DXF files."""
 
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,10 @@ from kitting_drake.hkd.tools.tool import LONGEST_MM, SHORTEST_MM
 
 _NOTES = ("DIMENSION", "ARC_DIMENSION", "LARGE_RADIAL_DIMENSION", "LEADER", "MULTILEADER")
 """DXF entities that annotate a drawing, so their lines do not belong to an outline."""
+_SMOOTHED, _CONTROL_POINT = 4, 16
+"""Flags of polylines and of their vertices."""
+_MORE_UNITS_MM = {8: 25.4e-6, 9: 0.0254, 21: 1200 / 3937 * 1e3, 22: 100 / 3937 * 1e3}
+"""Values of $INSUNITS that ezdxf does not convert: microinches, mils, US survey feet and inches."""
 
 
 def dxf_curves(path: Path, unit_mm: float | None = None) -> DrawnCurves:
@@ -29,7 +34,7 @@ def dxf_curves(path: Path, unit_mm: float | None = None) -> DrawnCurves:
         "ezdxf", "disassemble", "path", "units", purpose="DXF", extra="fabrication"
     )
     try:
-        document = ezdxf.readfile(path)
+        document = _document(ezdxf, path)
         hidden = {
             layer.dxf.name.lower()
             for layer in document.layers
@@ -47,6 +52,7 @@ def dxf_curves(path: Path, unit_mm: float | None = None) -> DrawnCurves:
         whole = filter(is_drawn, document.modelspace())
         found = []
         for entity in filter(is_drawn, ezdxf.disassemble.recursive_decompose(whole)):
+            _drop_control_points(entity)
             try:
                 curve = ezdxf.path.make_path(entity)
             except TypeError:
@@ -76,6 +82,31 @@ def dxf_curves(path: Path, unit_mm: float | None = None) -> DrawnCurves:
     return DrawnCurves(curves, measured, None, notes)
 
 
+def _document(ezdxf: Any, path: Path) -> Any:
+    """Reads a DXF; one whose writer left out the end of the file is complete, too.
+
+    Raises:
+        UserError: it is cut short.
+    """
+    data = path.read_bytes()
+    is_text = not data.startswith(b"AutoCAD Binary DXF")
+    last = data.split()[-1:]
+    if is_text and last != [b"EOF"]:
+        if last != [b"ENDSEC"]:
+            raise UserError(f"{path} is cut short or not a DXF: copy or export it again")
+        with tempfile.TemporaryDirectory() as scratch:
+            whole = Path(scratch) / "whole.dxf"
+            whole.write_bytes(data.rstrip() + b"\n0\nEOF\n")
+            return ezdxf.readfile(whole)
+    return ezdxf.readfile(path)
+
+
+def _drop_control_points(entity: Any) -> None:
+    """Removes the control points that a polyline smoothed as a spline keeps among its vertices."""
+    if entity.dxftype() == "POLYLINE" and entity.dxf.flags & _SMOOTHED:
+        entity.vertices[:] = [v for v in entity.vertices if not v.dxf.flags & _CONTROL_POINT]
+
+
 def _scale(
     ezdxf: Any, document: Any, path: Path, unit_mm: float | None, extent: float
 ) -> tuple[float, str]:
@@ -91,7 +122,9 @@ def _scale(
     units = ezdxf.units.InsertUnits(int(document.header.get("$INSUNITS", 0)) if given else 0)
     if units == ezdxf.units.InsertUnits.Unitless:
         return _likely(path, document, extent)
-    mm = ezdxf.units.conversion_factor(units, ezdxf.units.InsertUnits.Millimeters)
+    mm = _MORE_UNITS_MM.get(int(units)) or ezdxf.units.conversion_factor(
+        units, ezdxf.units.InsertUnits.Millimeters
+    )
     return mm, f"by its $INSUNITS, {units.name.lower()}"
 
 

@@ -10,7 +10,7 @@ from kitting_drake.common.errors import UserError
 from kitting_drake.hkd.importing.reading.stl import read_stl
 from kitting_drake.hkd.importing.reading.threemf import read_3mf
 
-FORMATS = (".stl", ".obj", ".ply", ".glb", ".gltf", ".3mf")
+FORMATS = (".stl", ".obj", ".ply", ".off", ".glb", ".gltf", ".3mf")
 IN_MM = (".3mf",)
 """The formats that state their unit; their vertices are converted to mm."""
 _SOLIDS = (".step", ".stp", ".iges", ".igs", ".sldprt", ".f3d", ".fcstd", ".scad", ".blend")

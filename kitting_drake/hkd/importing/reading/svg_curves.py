@@ -45,6 +45,7 @@ def svg_curves(path: Path, unit_mm: float | None = None) -> DrawnCurves:
         root = ElementTree.fromstring(text)
         if root.tag.rsplit("}", 1)[-1] != "svg":
             raise ValueError("the root is not an svg element")
+        _read_style(root)
         mm, measured = _scale(root, text, unit_mm)
         width, height = _settle_size(root)
         _keep_from_drawing(root)
@@ -57,8 +58,8 @@ def svg_curves(path: Path, unit_mm: float | None = None) -> DrawnCurves:
         seen = [e for e in shapes if _is_painted(e.fill) or _is_painted(e.stroke)]
         seen = [e for e in seen if str(e.values.get("opacity", 1)).strip() not in ("0", "0%")]
         curves = [
-            Curve(mm * np.array(points) * (1, -1), _is_painted(shape.fill))
-            for shape in seen or shapes
+            Curve(mm * np.array(points) * (1, -1), *_filling(shape, number))
+            for number, shape in enumerate(seen or shapes)
             # Convert to a path, because svgelements drops rotations of rectangles and ellipses.
             for part in abs(svgelements.Path(shape)).as_subpaths()
             if (points := _sampled(svgelements.Path(part), mm))
@@ -72,8 +73,22 @@ def svg_curves(path: Path, unit_mm: float | None = None) -> DrawnCurves:
     return DrawnCurves(curves, measured, page)
 
 
+def _filling(shape: Any, number: int) -> tuple[bool, int | None]:
+    """Whether a shape is filled, and its number if it is."""
+    filled = _is_painted(shape.fill)
+    return filled, number if filled else None
+
+
 def _is_painted(colour: Any) -> bool:
     return colour is not None and colour.value is not None and colour.opacity != 0
+
+
+def _read_style(root: ElementTree.Element) -> None:
+    """Takes the width and height of the root element from its style if it has no others."""
+    for name in ("width", "height"):
+        found = re.search(rf"(?:^|;)\s*{name}\s*:\s*([^;]+)", root.get("style", ""))
+        if found and name not in root.attrib:
+            root.set(name, found[1])
 
 
 def _scale(root: ElementTree.Element, text: bytes, unit_mm: float | None) -> tuple[float, str]:
@@ -173,12 +188,30 @@ def _settle_size(root: ElementTree.Element) -> tuple[float, float]:
     for name in given:
         # Normalize lengths, because svgelements reads `200 mm` as 200 pixels.
         root.set(name, "".join(_length(root.attrib[name], name)))
+    if len(given) == 2 and "viewBox" in root.attrib:
+        _match_rounded_box(root, [float(number) for number in box])
     if len(given) == 1 and "viewBox" in root.attrib:
         (known,) = given
         (other,) = sides.keys() - {known}
         number, unit = _length(root.attrib[known], known)
         root.set(other, f"{float(number) * sides[other] / sides[known]!r}{unit}")
     return sides["width"], sides["height"]
+
+
+def _match_rounded_box(root: ElementTree.Element, box: list[float]) -> None:
+    """Restores the shorter side of a viewBox that was rounded to whole numbers.
+
+    Otherwise the drawing would be scaled by the error of that side.
+    """
+    lengths = [_length(root.attrib[name], name) for name in ("width", "height")]
+    sides = [float(number) for number, _ in lengths]
+    if lengths[0][1] != lengths[1][1] or any(n != round(n) for n in box) or min(sides) <= 0:
+        return
+    long = int(box[3] > box[2])
+    exact = box[2 + long] * sides[1 - long] / sides[long]
+    if abs(exact - box[3 - long]) <= 1:
+        box[3 - long] = exact
+        root.set("viewBox", " ".join(map(repr, box)))
 
 
 def _length(text: str, name: str) -> tuple[str, str]:

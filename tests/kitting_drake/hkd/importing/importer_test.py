@@ -124,7 +124,7 @@ def test_drake_loads_the_model(plain: importer.ImportReport):
     assert "package://" not in load_tool(str(plain.directory)).sdf.read_text()
 
 
-@pytest.mark.parametrize("suffix", ["stl", "obj", "ply", "glb", "gltf"])
+@pytest.mark.parametrize("suffix", ["stl", "obj", "ply", "off", "glb", "gltf"])
 def test_every_format_is_read(suffix: str, tmp_path: Path):
     vertices, faces = read_mesh(exported(mallet(), tmp_path / f"mallet.{suffix}"))
     np.testing.assert_allclose(np.ptp(vertices, axis=0), mallet().extents, rtol=1e-6)

@@ -1,3 +1,4 @@
+import itertools
 from collections.abc import Callable
 from pathlib import Path
 
@@ -62,6 +63,27 @@ def with_unplotted_layers(space: BaseLayout) -> None:
         )
 
 
+def in_short_pieces(space: BaseLayout) -> None:
+    """Lines shorter than the gaps that are joined."""
+    turn = np.linspace(-np.pi / 2, np.pi / 2, 400)
+    for start, x in ((0, 140), (np.pi, 0)):
+        arc = np.c_[x + 10 * np.cos(turn + start), 10 + 10 * np.sin(turn + start)]
+        for a, b in itertools.pairwise(arc):
+            space.add_line(tuple(a), tuple(b))
+    space.add_line((0, 0), (140, 0))
+    space.add_line((0, 20), (140, 20))
+    space.add_circle((0, 10), 4)
+
+
+def overshooting(space: BaseLayout) -> None:
+    """Lines that cross where they should end."""
+    space.add_line((0.03, 0), (140, 0))
+    space.add_arc((140, 10), 10, -89.9, 90.1)
+    space.add_line((140, 20), (0, 20.03))
+    space.add_arc((0, 10), 10, 90, 270)
+    space.add_circle((0, 10), 4)
+
+
 def with_a_layout(space: BaseLayout) -> None:
     slot(space)
     space.doc.layout("Layout1").add_lwpolyline([(0, 0), (297, 0), (297, 210)], close=True)
@@ -78,6 +100,8 @@ def with_a_layout(space: BaseLayout) -> None:
         (on_a_sheet, "A4"),
         (with_unplotted_layers, "2 entities that are hidden or not plotted"),
         (with_a_layout, None),
+        (in_short_pieces, None),
+        (overshooting, None),
     ],
 )
 def test_the_outline_is_what_is_plotted_once(
@@ -93,7 +117,14 @@ def test_the_outline_is_what_is_plotted_once(
 
 @pytest.mark.parametrize(
     ("units", "scale", "said"),
-    [(4, 1, "millimeters"), (5, 0.1, "cent"), (1, 1 / 25.4, "inches"), (6, 0.001, "meters")],
+    [
+        (4, 1, "millimeters"),
+        (5, 0.1, "cent"),
+        (1, 1 / 25.4, "inches"),
+        (6, 0.001, "meters"),
+        (9, 1000 / 25.4, "mils"),
+        (13, 1000, "microns"),
+    ],
 )
 def test_a_drawing_has_the_unit_that_it_names(units: int, scale: float, said: str, tmp_path: Path):
     document = ezdxf.new(units=units)
@@ -117,6 +148,28 @@ def test_a_drawing_without_a_unit_is_in_mm_or_as_asked(header: str, tmp_path: Pa
     assert drawing.outline.bounds() == pytest.approx((0, 0, 160, 20), abs=1e-6)
     assert "because the file states no unit" in drawing.measured
     assert read_drawing(path, 25.4).outline.area() == pytest.approx(25.4**2 * 3200, rel=1e-6)
+
+
+def test_a_missing_end_is_not_a_missing_part(tmp_path: Path):
+    whole = box(tmp_path / "tool.dxf", 1.0, 1).read_text()
+    (tmp_path / "tool.dxf").write_text("999\nby a program\n" + whole.removesuffix("0\nEOF\n"))
+    assert read_drawing(tmp_path / "tool.dxf").outline.area() == pytest.approx(3200, rel=1e-3)
+    (tmp_path / "tool.dxf").write_text(whole[: -len("0\nENDSEC\n0\nEOF\n")])
+    with pytest.raises(UserError, match="cut short"):
+        read_drawing(tmp_path / "tool.dxf")
+
+
+def test_a_smoothed_polyline_is_its_curve_not_its_control_points(tmp_path: Path):
+    document = ezdxf.new("R12")
+    turn = np.linspace(0, 2 * np.pi, 64, endpoint=False)
+    ellipse = np.c_[80 * np.cos(turn), 10 * np.sin(turn)]
+    line = document.modelspace().add_polyline2d([*(1.5 * ellipse[::8]), *ellipse], close=True)
+    line.dxf.flags |= 4
+    for vertex in line.vertices[:8]:
+        vertex.dxf.flags |= 16
+    document.saveas(tmp_path / "tool.dxf")
+    drawing = read_drawing(tmp_path / "tool.dxf")
+    assert drawing.outline.area() == pytest.approx(800 * np.pi, rel=5e-3)
 
 
 def test_paper_space_is_named(tmp_path: Path):

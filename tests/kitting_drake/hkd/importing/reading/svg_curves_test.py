@@ -49,6 +49,9 @@ MM = 'width="200mm" height="60mm" viewBox="0 0 200 60"'
         (svg(bar(25.4 / 72), 'width="595" height="842"'), "A4 in units of 1/72 inch"),
         (svg(bar(25.4 / 90), 'width="744.09" height="1052.36" viewBox="0 0 744.09 1052.36"'), "A4"),
         (svg(bar(25.4), 'width="8in" height="2.4in" viewBox="0 0 8 2.4"'), "width and height"),
+        # The viewBox is rounded up to whole units of 1/72 inch.
+        (svg(bar(25.4 / 72), 'width="200mm" height="60mm" viewBox="0 0 567 171"'), "width and"),
+        (svg(bar(), 'style="width:200mm;height:60mm" viewBox="0 0 200 60"'), "width and height"),
     ],
 )
 def test_a_drawing_has_the_size_that_its_program_meant(text: str, said: str, tmp_path: Path):
@@ -146,3 +149,45 @@ def test_the_smallest_gap_is_told_with_its_place(tmp_path: Path):
     path.write_text(svg(f'<path fill="none" stroke="#000" d="{lines}"/>', MM))
     with pytest.raises(UserError, match=r"gap of 0\.30 mm at x = 180\.0, y = 30\.[12]"):
         read_drawing(path)
+
+
+LINE = 'fill="none" stroke="#000"'
+SOLID = '<path fill="#333" d="M20 20h160v20h-160z"/>'
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        # A frame around a tool without holes: square, with round corners, or as large as the page.
+        f'<rect x="5" y="5" width="190" height="50" {LINE}/>' + SOLID,
+        f'<rect x="5" y="5" width="190" height="50" rx="8" {LINE}/>' + SOLID,
+        f'<rect width="200" height="60" {LINE}/><path {LINE} d="M20 20h160v20h-160z"/>',
+        f'<path {LINE} d="M5 5h190v50h-190z M20 20h160v20h-160z"/>',
+    ],
+)
+def test_a_frame_that_may_be_the_tool_is_a_question(content: str, tmp_path: Path):
+    path = tmp_path / "tool.svg"
+    path.write_text(svg(content, MM))
+    with pytest.raises(UserError, match=r"around a curve of 160 x 20 mm.*--frame page"):
+        read_drawing(path)
+    drawing = read_drawing(path, frame="page")
+    assert drawing.outline.area() == pytest.approx(160 * 20, rel=1e-3)
+    assert "left out a rectangle" in drawing.notes[0]
+    assert read_drawing(path, frame="tool").outline.num_contour() == 2
+
+
+@pytest.mark.parametrize(
+    "plate",
+    [
+        # One filled element, a round hole, and a small one.
+        '<path fill-rule="evenodd" d="M20 10h120v40h-120z M40 20h80v20h-80z"/>',
+        f'<rect x="20" y="10" width="120" height="40" {LINE}/><circle cx="80" cy="30" r="16"/>',
+        '<rect x="20" y="10" width="120" height="40"/><rect x="60" y="25" width="20" height="6"/>',
+    ],
+)
+def test_a_plate_with_a_hole_is_the_tool(plate: str, tmp_path: Path):
+    (tmp_path / "tool.svg").write_text(svg(plate, MM))
+    drawing = read_drawing(tmp_path / "tool.svg")
+    assert drawing.outline.bounds() == pytest.approx((20, -50, 140, -10), abs=0.01)
+    assert drawing.outline.num_contour() == 2
+    assert drawing.notes == []
