@@ -206,6 +206,7 @@ def _add_trace(benchmarks: Any) -> None:
     tracing.add_argument(
         "--keep", action="store_true", help="a folder in which to keep the photos and the pictures"
     )
+    tracing.add_argument("--seed", type=int, default=0, help="seed of the photos (default: 0)")
 
 
 def _add_reach(benchmarks: Any) -> None:
@@ -409,6 +410,7 @@ def _trace(arguments: argparse.Namespace, console: Console, folder: Path) -> lis
         console,
         folder / "photos" if arguments.keep else None,
         exif=not arguments.no_exif,
+        seed=arguments.seed,
     )
     write_json(folder / "trace.json", measured)
     return [trace_table(measured)]

@@ -130,6 +130,16 @@ def trace_photo(args: argparse.Namespace) -> None:
         size = " x ".join(f"{side:.1f}" for side in tool.size_mm)
         holes = "1 hole" if tool.holes == 1 else f"{tool.holes or 'no'} holes"
         console.print(f"{tool.name}: {size} mm, {holes}")
+        if tool.doubts:
+            places = ", ".join(
+                f"({x:.0f}, {y:.0f})" for x, y in (item.place for item in tool.doubts)
+            )
+            console.print(
+                f"  DOUBT: its outline may be wrong near {places} mm, where tool, shine and shadow "
+                "look alike: see the red circles in trace.png, and mend it with --points or take "
+                "the photo in softer light",
+                soft_wrap=True,
+            )
     for note in report.notes:
         console.print(f"  {note}", soft_wrap=True)
     console.print(f"look at {args.output}/trace.png before you cut", soft_wrap=True)

@@ -23,6 +23,14 @@ class Corrections:
     """The sheet's corners (4, 2) in pixels of the photo, counter-clockwise in the picture; None:
     found automatically."""
 
+    def settles(self, place: tuple[float, float]) -> bool:
+        """Whether a polygon holds a place, in mm, so that the user has looked at it."""
+        spot = CrossSection.square((0.1, 0.1), True).translate(place)
+        return any(
+            not (CrossSection([points], FillRule.EvenOdd) ^ spot).is_empty()
+            for _, points in self.steps
+        )
+
     def applied(self, area: CrossSection) -> CrossSection:
         """Returns an area with the polygons added and removed."""
         for kind, points in self.steps:

@@ -1,5 +1,6 @@
 """Finds the silhouettes of tools on a rectified photo, in mm."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ from kitting_drake.common.errors import UserError
 from kitting_drake.hkd.tracing.ground_light import flattened, log_light
 from kitting_drake.hkd.tracing.photo_file import linear
 from kitting_drake.hkd.tracing.plane_view import RectifiedPhoto
-from kitting_drake.hkd.tracing.tool_mask import tool_mask
+from kitting_drake.hkd.tracing.tool_mask import BOLD, ToolMasks, look_for
 
 Array = NDArray[Any]
 
@@ -20,6 +21,18 @@ in mm."""
 _LEAST_LOOP_MM2 = 4.0
 _LEAST_TOOL_MM2 = 60.0
 _FLAT_MM = 0.03
+_EDGE_SLACK_MM = 0.4
+"""Two looks at an edge may be twice this apart."""
+
+
+@dataclass(frozen=True)
+class Unclear:
+    """A region that may be tool, or may be ground or shadow."""
+
+    place: tuple[float, float]
+    """Its middle, in mm."""
+    area: float
+    """In mm^2."""
 
 
 def find_silhouettes(
@@ -27,7 +40,8 @@ def find_silhouettes(
     photo: RectifiedPhoto,
     sheet: Array | None,
     hidden: tuple[Array, ...],
-) -> tuple[CrossSection, float]:
+    height: float | None = None,
+) -> tuple[CrossSection, float, list[Unclear]]:
     """Finds the area that tools cover.
 
     Args:
@@ -36,9 +50,10 @@ def find_silhouettes(
         sheet: (2,) the size of the sheet, whose lower left corner is the origin. The tools lie on
             it. None: the whole photo is ground.
         hidden: polygons to leave out.
+        height: of the lowest tool, in mm, if it is known.
 
     Returns:
-        The area in mm, and the width of the blur of its border in mm.
+        The area in mm, the width of the blur of its border in mm, and what is not clear.
 
     Raises:
         UserError: a tool extends beyond the sheet's edge.
@@ -51,7 +66,8 @@ def find_silhouettes(
     for polygon in hidden:
         ground &= ~_polygon(cv2, photo, polygon)
     ratio, spread = flattened(cv2, logs, ground, ppm)
-    mask = tool_mask(cv2, ratio, ground, spread, ppm)
+    masks = ToolMasks(cv2, ratio, ground, spread, ppm)
+    mask = masks.mask(look_for(height))
     if sheet is not None:
         inner = _polygon(cv2, photo, _rectangle(_RIM_MM + 0.5, sheet - _RIM_MM - 0.5))
         if mask[~inner].any():
@@ -60,10 +76,28 @@ def find_silhouettes(
                 "sheet (--sheet LENGTH WIDTH)"
             )
     if not mask.any():
-        return CrossSection(), 0.0
+        return CrossSection(), 0.0, []
     soft = soft_mask(cv2, photo, mask)
     area = _cleaned(contours(photo, soft))
-    return area, _blur_mm(cv2, soft, mask, ppm)
+    differ = (mask ^ masks.mask(BOLD)) | masks.shine(mask)
+    unclear = _unclear(cv2, photo, differ)
+    return area, _blur_mm(cv2, soft, mask, ppm), unclear
+
+
+def _unclear(cv2: Any, photo: RectifiedPhoto, differ: Array) -> list[Unclear]:
+    """The regions that may be tool or ground, the largest first."""
+    ppm = photo.px_per_mm
+    radius = max(1, round(_EDGE_SLACK_MM * ppm))
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+    differ = cv2.morphologyEx(differ, cv2.MORPH_OPEN, disc)
+    _, _, stats, centres = cv2.connectedComponentsWithStats(differ, connectivity=8)
+    areas = stats[1:, cv2.CC_STAT_AREA] / ppm**2
+    places = photo.to_mm(centres[1:]) if len(areas) else centres[1:]
+    found = [
+        Unclear((float(x), float(y)), float(area))
+        for (x, y), area in zip(places, areas, strict=True)
+    ]
+    return sorted(found, key=lambda item: -item.area)
 
 
 def _rectangle(low: Array | float, high: Array) -> Array:

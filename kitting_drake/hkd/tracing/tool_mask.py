@@ -1,6 +1,7 @@
 """Separates tools from a plain ground and from their shadows."""
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,8 +14,6 @@ _DARKER, _BRIGHTER, _COLOURED = 0.22, 0.12, 0.11
 brighter, or differently coloured."""
 _NO_SHADOW = 1.3
 """The largest darkening by a shadow, in logarithms of light."""
-_STEEP = 0.45
-"""The slope at which an edge is too steep to be a shadow's, in logarithms of light per mm."""
 _BALL_MM = 0.9
 """The radius of the disc that must fit wherever the ground is found, in mm."""
 _ROUGH = 0.022
@@ -25,7 +24,11 @@ _STRIP_MM = 1.2
 _EDGE_MM = 2.3
 _SHINE_STEEP = 0.6
 """The largest slope of the edge of a specular reflection, in logarithms of light per mm."""
-_BAY_MM = 8.0
+_STEP_REACH_MM = 1.5
+_SHINY, _SHINY_SHARE = 0.06, 0.25
+"""Where more than this share is brighter than the ground, in logarithms of light, is no ground."""
+_SHINE_REACH_MM = 3.0
+_BAY_MM = 12.0
 """Half the width, in mm, below which a bright band with soft edges across a tool is a
 reflection."""
 _NEUTRAL = 0.05
@@ -37,62 +40,142 @@ _LEAST_HOLE_MM2 = 4.0
 _LEAST_HOLE_RADIUS_MM = 0.7
 
 
-def tool_mask(cv2: Any, ratio: Array, ground: Array, spread: float, px_per_mm: float) -> Array:
-    """Separates tools from the ground and from shadows.
+@dataclass(frozen=True)
+class ShadowLook:
+    """How readily a shadow is seen to go on."""
 
-    Pixels that look like the ground are ground. Shadows are ground too: they are neutral in colour,
-    and connected to the ground without a steep step. The rest is a tool. Finally a watershed moves
-    the border to the steepest step between the two.
+    steep: float
+    """A steeper step of the logarithm of light, per mm, is not the edge of a shadow."""
+    rough: float
+    """What is rougher than the plain ground by more than this factor is not a shadow."""
+    shine: float
+    """A bay or hole whose border is wider than this, in mm, on three tenths of it is shine."""
 
-    Args:
-        cv2: OpenCV.
-        ratio: (rows, columns, 3) the logarithms from `ground_light.flattened`.
-        ground: (rows, columns) true where tools may be.
-        spread: the standard deviation from `ground_light.flattened`.
-        px_per_mm: the resolution.
 
-    Returns:
-        A mask (rows, columns): 1 where a tool hides the ground.
-    """
-    smooth = cv2.GaussianBlur(ratio, (0, 0), 0.12 * px_per_mm + 0.3)
-    lightness, colour = _lightness_and_colour(cv2, smooth)
-    steep = _steepness(cv2, smooth, px_per_mm)
-    noise = max(1.0, 4 * spread / _DARKER)
-    evidence = np.maximum(-lightness / _DARKER, lightness / _BRIGHTER)
-    evidence = np.maximum(evidence, colour / _COLOURED) / noise
-    evidence[~ground] = 0
-    free = (steep < _STEEP * noise) & (colour < _COLOURED * noise)
-    free &= (lightness > -_NO_SHADOW) & (lightness < _BRIGHTER * noise)
-    free |= ~ground
-    plain = evidence < 0.5
-    light = cv2.transform(ratio, np.full((1, 3), 1 / 3, np.float32))
-    rough = _roughness(cv2, light, cv2.GaussianBlur(light, (0, 0), 0.5 * px_per_mm), px_per_mm)
-    usual = _median(rough[plain & ground], _ROUGH)
-    even = (free & (rough < max(_ROUGH, 3 * usual))) | ~ground
-    reached = _reached(cv2, even, plain, px_per_mm)
-    # A hole may lie wholly in shadow, so its edges are close. A median filter keeps edges, so they
-    # do not count as roughness.
-    finely = _roughness(cv2, light, cv2.medianBlur(light, 5), px_per_mm)
-    limit = 1.7 * _median(finely[plain & ground], _ROUGH) * np.exp(-lightness / 2)
-    like_ground = (colour < _NEUTRAL * noise) & (finely < limit)
-    reached |= _shaded_holes(cv2, free & (finely < 2 * limit) & ~reached, like_ground, px_per_mm)
-    # The edge of a tool is rough on both sides. So extend the ground over rough pixels, up to a
-    # steep step.
-    for _ in range(math.ceil(_EDGE_MM * px_per_mm)):
-        reached |= (cv2.dilate(reached.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0) & free
-    tool = _components(cv2, (~reached).astype(np.uint8), evidence, px_per_mm)
-    tool = _without_shine(cv2, tool, steep, px_per_mm)
-    markers = np.zeros(ratio.shape[:2], np.int32)
-    markers[cv2.dilate(tool, _disc(cv2, 0.4 * px_per_mm)) == 0] = 1
-    markers[cv2.erode(tool, _disc(cv2, 0.4 * px_per_mm)) > 0] = 2
-    markers[~ground] = 1
-    image = ((np.clip(-smooth, -0.3, 2.25) + 0.3) * 100).astype(np.uint8)
-    cv2.watershed(np.ascontiguousarray(image), markers)
-    mask = (markers == 2).astype(np.uint8)
-    # The watershed's lines belong to neither side; assign each to the side with more of its
-    # neighbours.
-    mask[(markers == -1) & (cv2.blur(mask.astype(np.float32), (3, 3)) > 0.4)] = 1
-    return _cleaned(cv2, mask, evidence, px_per_mm)
+CAREFUL = ShadowLook(0.3, 2.0, 1.2)
+"""Takes faint edges for those of tools. The edge of a low tool's shadow may be as sharp."""
+MIDDLE = ShadowLook(0.45, 3.0, 1.2)
+BOLD = ShadowLook(0.65, 4.0, math.inf)
+"""Follows shadows over faint edges. What only one of two looks takes for a tool is not clear."""
+_LOW_MM = 9.0
+
+
+def look_for(height: float | None) -> ShadowLook:
+    """The look that suits tools of a height in mm; None: not known."""
+    return MIDDLE if height is None or height < _LOW_MM else CAREFUL
+
+
+class ToolMasks:
+    """Tells tools from the ground of one photo, by one look or another."""
+
+    def __init__(
+        self, cv2: Any, ratio: Array, ground: Array, spread: float, px_per_mm: float
+    ) -> None:
+        """Measures the photo.
+
+        Args:
+            cv2: OpenCV.
+            ratio, spread: from `ground_light.flattened`.
+            ground: (rows, columns) where tools may be.
+            px_per_mm: the resolution.
+        """
+        self._cv2, self._ground, self._px_per_mm = cv2, ground, px_per_mm
+        self._smooth = cv2.GaussianBlur(ratio, (0, 0), 0.12 * px_per_mm + 0.3)
+        self._lightness, self._colour = _lightness_and_colour(cv2, self._smooth)
+        self._steep = _steepness(cv2, self._smooth, px_per_mm)
+        self._noise = noise = max(1.0, 4 * spread / _DARKER)
+        evidence = np.maximum(-self._lightness / _DARKER, self._lightness / _BRIGHTER)
+        self._evidence = np.maximum(evidence, self._colour / _COLOURED) / noise
+        self._evidence[~ground] = 0
+        self._plain = self._evidence < 0.5
+        light = cv2.transform(ratio, np.full((1, 3), 1 / 3, np.float32))
+        even = cv2.GaussianBlur(light, (0, 0), 0.5 * px_per_mm)
+        self._rough = _roughness(cv2, light, even, px_per_mm)
+        self._usual = _median(self._rough[self._plain & ground], _ROUGH)
+        # The steepest step near each pixel, and how wide it is.
+        self._peak = cv2.dilate(self._steep, _disc(cv2, 0.7 * px_per_mm))
+        disc = _disc(cv2, _STEP_REACH_MM * px_per_mm)
+        span = cv2.dilate(self._lightness, disc) - cv2.erode(self._lightness, disc)
+        self._width = span / np.maximum(self._peak, 1e-3)
+        # A median filter keeps edges, so they do not count as roughness.
+        self._fine = _roughness(cv2, light, cv2.medianBlur(light, 5), px_per_mm)
+
+    def mask(self, look: ShadowLook) -> Array:
+        """Returns a mask (rows, columns): 1 where a tool hides the ground.
+
+        Pixels that look like the ground are ground. So are shadows: neutral pixels that are
+        reached from there over soft steps. The rest is a tool. A watershed puts its border at the
+        steepest step between the two.
+        """
+        cv2, ground, px_per_mm, noise = self._cv2, self._ground, self._px_per_mm, self._noise
+        free = (self._steep < look.steep * noise) & (self._colour < _COLOURED * noise)
+        free &= (self._lightness > -_NO_SHADOW) & (self._lightness < _BRIGHTER * noise)
+        free |= ~ground
+        limit = max(_ROUGH * look.rough / 3, look.rough * self._usual)
+        even = (free & (self._rough < limit)) | ~ground
+        reached = _reached(cv2, even, self._plain, px_per_mm)
+        # A hole may lie wholly in shadow, so its edges are close.
+        limit = 1.7 * _median(self._fine[self._plain & ground], _ROUGH)
+        limit = limit * np.exp(-self._lightness / 2)
+        like_ground = (self._colour < _NEUTRAL * noise) & (self._fine < limit)
+        shaded = free & (self._fine < 2 * limit) & ~reached
+        reached |= _shaded_holes(cv2, shaded, like_ground, px_per_mm)
+        # The edge of a tool is rough on both sides. So extend the ground over rough pixels, up to
+        # a steep step.
+        for _ in range(math.ceil(_EDGE_MM * px_per_mm)):
+            grown = cv2.dilate(reached.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+            reached |= grown & free
+        tool = _components(cv2, (~reached).astype(np.uint8), self._evidence, px_per_mm)
+        return self._bordered(self._without_shine(tool, look.shine))
+
+    def shine(self, mask: Array) -> Array:
+        """(rows, columns) 1 beside a mask where it is brighter than ground can be."""
+        cv2 = self._cv2
+        near = cv2.dilate(mask, _disc(cv2, _SHINE_REACH_MM * self._px_per_mm))
+        bright = (self._lightness > 2 * _SHINY * self._noise) & self._ground
+        return ((near > mask) & bright).astype(np.uint8)
+
+    def _without_shine(self, tool: Array, widest: float) -> Array:
+        """Fills bays and holes where the tool shines.
+
+        Their border with the tool is soft, or they are brighter than the ground.
+        """
+        cv2, px_per_mm = self._cv2, self._px_per_mm
+        closed = _closed(cv2, tool, _BAY_MM * px_per_mm, px_per_mm)
+        rim = (tool > 0) & (cv2.erode(tool, _disc(cv2, 1)) == 0)
+        bays = (closed & (tool == 0)).astype(np.uint8)
+        count, labels, stats, _ = cv2.connectedComponentsWithStats(bays, connectivity=4)
+        filled = tool.copy()
+        for i in range(1, count):
+            x, y, width, height, area = stats[i]
+            if area < 0.5 * px_per_mm**2:
+                continue
+            box = (slice(max(0, y - 2), y + height + 2), slice(max(0, x - 2), x + width + 2))
+            bay = labels[box] == i
+            border = (cv2.dilate(bay.astype(np.uint8), _disc(cv2, 1)) > 0) & rim[box]
+            if not border.any():
+                continue
+            soft = np.median(self._peak[box][border]) < _SHINE_STEEP
+            # One side of shine may be a sharp edge.
+            soft |= np.percentile(self._width[box][border], 70) > widest
+            if soft or (self._lightness[box][bay] > _SHINY).mean() > _SHINY_SHARE:
+                filled[box][bay] = 1
+        return filled
+
+    def _bordered(self, tool: Array) -> Array:
+        """A mask whose border is moved to the steepest step nearby."""
+        cv2, px_per_mm = self._cv2, self._px_per_mm
+        markers = np.zeros(tool.shape, np.int32)
+        markers[cv2.dilate(tool, _disc(cv2, 0.4 * px_per_mm)) == 0] = 1
+        markers[cv2.erode(tool, _disc(cv2, 0.4 * px_per_mm)) > 0] = 2
+        markers[~self._ground] = 1
+        image = ((np.clip(-self._smooth, -0.3, 2.25) + 0.3) * 100).astype(np.uint8)
+        cv2.watershed(np.ascontiguousarray(image), markers)
+        mask = (markers == 2).astype(np.uint8)
+        # The watershed's lines belong to neither side; assign each to the side with more of its
+        # neighbours.
+        mask[(markers == -1) & (cv2.blur(mask.astype(np.float32), (3, 3)) > 0.4)] = 1
+        return _cleaned(cv2, mask, self._evidence, px_per_mm)
 
 
 def _median(values: Array, otherwise: float) -> float:
@@ -151,34 +234,16 @@ def _shaded_holes(cv2: Any, even: Array, like_ground: Array, px_per_mm: float) -
     return cv2.dilate(table[labels].astype(np.uint8), disc) > 0
 
 
-def _without_shine(cv2: Any, tool: Array, steep: Array, px_per_mm: float) -> Array:
-    """Fills bays and holes of a tool whose border is soft, because they are reflections."""
-    rows, columns = tool.shape
-    # Work at a lower resolution, because a large disc is slow at the full one.
+def _closed(cv2: Any, mask: Array, radius: float, px_per_mm: float) -> Array:
+    """A mask closed by a large disc, at a coarser resolution, which is faster."""
+    rows, columns = mask.shape
     factor = max(1, int(px_per_mm / 1.5))
-    margin = math.ceil(_BAY_MM * px_per_mm / factor) + 2
-    small = cv2.resize(tool, None, fx=1 / factor, fy=1 / factor, interpolation=cv2.INTER_AREA)
+    margin = math.ceil(radius / factor) + 2
+    small = cv2.resize(mask, None, fx=1 / factor, fy=1 / factor, interpolation=cv2.INTER_AREA)
     small = cv2.copyMakeBorder(small, *(margin,) * 4, cv2.BORDER_CONSTANT, value=0)
-    small = cv2.morphologyEx(small, cv2.MORPH_CLOSE, _disc(cv2, _BAY_MM * px_per_mm / factor))
+    small = cv2.morphologyEx(small, cv2.MORPH_CLOSE, _disc(cv2, radius / factor))
     small = small[margin:-margin, margin:-margin].astype(np.float32)
-    closed = cv2.resize(small, (columns, rows), interpolation=cv2.INTER_LINEAR) > 0.5
-    peak = cv2.dilate(steep, _disc(cv2, 0.7 * px_per_mm))
-    rim = (tool > 0) & (cv2.erode(tool, _disc(cv2, 1)) == 0)
-    bays = (closed & (tool == 0)).astype(np.uint8)
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(bays, connectivity=4)
-    filled = tool.copy()
-    for i in range(1, count):
-        x, y, width, height, area = stats[i]
-        if area < 0.5 * px_per_mm**2:
-            continue
-        box = (slice(max(0, y - 2), y + height + 2), slice(max(0, x - 2), x + width + 2))
-        bay = labels[box] == i
-        border = (cv2.dilate(bay.astype(np.uint8), _disc(cv2, 1)) > 0) & rim[box]
-        if not border.any():
-            continue
-        if np.median(peak[box][border]) < _SHINE_STEEP:
-            filled[box][bay] = 1
-    return filled
+    return cv2.resize(small, (columns, rows), interpolation=cv2.INTER_LINEAR) > 0.5
 
 
 def _disc(cv2: Any, radius: float) -> Any:

@@ -58,6 +58,7 @@ def outlines_dxf(outlines: dict[str, CrossSection]) -> str:
 
 _LONG_SIDE = 1500
 _SILHOUETTE, _OUTLINE, _INK = (255, 0, 200), (0, 150, 60), (20, 20, 20)
+_DOUBT, _DOUBT_PX = (230, 20, 20), 28
 _EDGE = 46
 """The width of the rulers, in pixels."""
 _BAR_MM = 50
@@ -68,11 +69,20 @@ def trace_png(
     photo: RectifiedPhoto,
     silhouette: CrossSection,
     outlines: dict[str, CrossSection],
+    doubts: list[tuple[float, float]],
     caption: str,
 ) -> bytes:
     """Draws the picture of a trace as a PNG.
 
     The rulers along its sides show the coordinates in mm that the file of `--points` uses.
+
+    Args:
+        cv2: OpenCV.
+        photo: the plane from above.
+        silhouette: as seen, in mm.
+        outlines: of each tool, in mm.
+        doubts: places, in mm, where an outline may be wrong.
+        caption: a line above the picture.
     """
     scale = _LONG_SIDE / max(photo.shape)
     resized = cv2.resize(photo.pixels, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
@@ -97,6 +107,9 @@ def trace_png(
         x_low, _, _, y_high = outline.bounds()
         u, v = np.round(place([(x_low, y_high)])[0]).astype(int).tolist()
         write(name, (u, v - 6), 0.55)
+    for point in doubts:
+        u, v = np.round(place([point])[0]).astype(int).tolist()
+        cv2.circle(image, (u, v), _DOUBT_PX, _DOUBT, 3, cv2.LINE_AA)
     _draw_rulers(cv2, image, photo, place, write)
     bottom = image.shape[0] - _EDGE - 16
     start, end = place([(photo.low[0] + 10, 0), (photo.low[0] + 10 + _BAR_MM, 0)])[:, 0]
@@ -105,7 +118,8 @@ def trace_png(
     cv2.rectangle(image, (start, bottom), (end, bottom + 5), _INK, -1)
     write(f"{_BAR_MM} mm", (start, bottom - 6), 0.5)
     write(caption, (_EDGE, 24), 0.55)
-    write("pink: the edge seen in the photo; green: the outline", (_EDGE, 48), 0.5)
+    legend = "pink: the edge seen in the photo; green: the outline"
+    write(legend + ("; red: not clear" if doubts else ""), (_EDGE, 48), 0.5)
     _, data = cv2.imencode(".png", image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])
     return data.tobytes()
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from manifold3d import CrossSection
+from manifold3d import CrossSection, JoinType
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.extras import import_extra
@@ -24,7 +24,7 @@ from kitting_drake.hkd.tracing.photo_file import Photo, read_photo
 from kitting_drake.hkd.tracing.plane_view import RectifiedPhoto, rectify
 from kitting_drake.hkd.tracing.scales import Scale, plane_of_scale
 from kitting_drake.hkd.tracing.sheet_plane import GroundPlane, plane_of_sheet
-from kitting_drake.hkd.tracing.silhouettes import find_silhouettes
+from kitting_drake.hkd.tracing.silhouettes import Unclear, find_silhouettes
 from kitting_drake.hkd.tracing.tool_height import outline_of_silhouette
 from kitting_drake.hkd.tracing.trace_files import outlines_dxf, outlines_svg, trace_png
 
@@ -36,6 +36,11 @@ _BLURRED_MM = 1.6
 _HEIGHTS_MM = (0.5, 100.0)
 _CAMERAS_MM = (100.0, 3000.0)
 _SHARE_OF_HEIGHT = 0.5
+_DOUBTED_MM = 0.12
+"""An outline is in doubt if what is not clear has a larger area than its length times this."""
+_MOST_DOUBTS = 4
+_APART_MM = 15.0
+"""Silhouettes closer than this may be of one tool."""
 
 
 @dataclass(frozen=True)
@@ -69,6 +74,8 @@ class TracedTool:
     """The outline in mm, in the plane's frame."""
     height_mm: float | None
     svg: Path
+    doubts: tuple[Unclear, ...] = ()
+    """Where the outline may be wrong; empty if the photo shows it clearly."""
 
     @property
     def holes(self) -> int:
@@ -112,7 +119,8 @@ def trace(request: TraceRequest) -> TraceReport:
         else plane_of_sheet(cv2, photo, request.sheet_mm, corrections.corners, request.camera_mm)
     )
     _check_view(photo, plane)
-    seen, silhouette, blur = _look(cv2, photo, plane)
+    seen, silhouette, blur, unclear = _look(cv2, photo, plane, request.heights_mm)
+    unclear = [item for item in unclear if not corrections.settles(item.place)]
     silhouette = corrections.applied(silhouette)
     parts = [part for part in silhouette.decompose() if part.area() > 0]
     parts.sort(key=lambda part: part.bounds()[0])
@@ -120,11 +128,13 @@ def trace(request: TraceRequest) -> TraceReport:
     heights = _heights(request, len(parts))
     names = [name] if len(parts) == 1 else [f"{name}_{i + 1}" for i in range(len(parts))]
     tools = []
-    for part, height, own in zip(parts, heights, names, strict=True):
+    doubts = _doubts(parts, unclear)
+    for part, height, own, doubtful in zip(parts, heights, names, doubts, strict=True):
         outline = part
         if height is not None:
             outline = _corrected(photo, part, plane, height, request.edges)
-        tools.append(TracedTool(own, outline, height, request.output / f"{own}.svg"))
+        svg = request.output / f"{own}.svg"
+        tools.append(TracedTool(own, outline, height, svg, doubtful))
     notes = [*plane.notes, *_view_notes(plane, request, len(parts))]
     _write(cv2, request, tools, notes, seen, silhouette, plane)
     return TraceReport(tools, notes)
@@ -154,12 +164,17 @@ def _check_view(photo: Photo, plane: GroundPlane) -> None:
         )
 
 
-def _look(cv2: Any, photo: Photo, plane: GroundPlane) -> tuple[RectifiedPhoto, CrossSection, float]:
-    """Returns the photo as seen from above, the tools' silhouettes, and the width of their blur in
-    mm."""
+def _look(
+    cv2: Any, photo: Photo, plane: GroundPlane, heights: tuple[float, ...]
+) -> tuple[RectifiedPhoto, CrossSection, float, list[Unclear]]:
+    """Returns the photo as seen from above, the tools' silhouettes, the width of their blur in mm,
+    and what is not clear."""
     seen = _rectified(cv2, plane)
     try:
-        return (seen, *find_silhouettes(cv2, seen, plane.sheet, plane.hidden))
+        return (
+            seen,
+            *find_silhouettes(cv2, seen, plane.sheet, plane.hidden, min(heights, default=None)),
+        )
     except UserError as error:
         raise UserError(f"{photo.path}: {error}") from error
 
@@ -199,6 +214,45 @@ def _check_parts(
                     f"{photo.path}: a tool touches the photo's edge: show the whole tool, and "
                     "some ground around it"
                 )
+
+
+def _doubts(parts: list[CrossSection], unclear: list[Unclear]) -> list[tuple[Unclear, ...]]:
+    """For each silhouette, what is not clear of it, the largest first, if it matters."""
+    near: list[list[Unclear]] = [[] for _ in parts]
+    for item in unclear:
+        square = CrossSection.square((1.0, 1.0), True).translate(item.place)
+        away = [
+            CrossSection.batch_hull([part.hull(), square]).area() - part.hull().area()
+            for part in parts
+        ]
+        near[int(np.argmin(away))].append(item)
+    result = []
+    for i, (part, items) in enumerate(zip(parts, near, strict=True)):
+        matters = sum(item.area for item in items) > _DOUBTED_MM * _perimeter(part)
+        split = [
+            item
+            for j, other in enumerate(parts)
+            if j != i and (item := _gap_between(part, other)) is not None
+        ]
+        result.append(tuple([*split, *(items if matters else [])][:_MOST_DOUBTS]))
+    return result
+
+
+def _gap_between(part: CrossSection, other: CrossSection) -> Unclear | None:
+    """The gap between two silhouettes that are so close that shine may have split one tool."""
+    grown = _APART_MM / 2
+    bridge = part.offset(grown, JoinType.Round) ^ other.offset(grown, JoinType.Round)
+    if bridge.is_empty():
+        return None
+    x_low, y_low, x_high, y_high = bridge.bounds()
+    return Unclear(((x_low + x_high) / 2, (y_low + y_high) / 2), bridge.area())
+
+
+def _perimeter(area: CrossSection) -> float:
+    loops = [np.asarray(loop) for loop in area.to_polygons()]
+    return sum(
+        float(np.linalg.norm(loop - np.roll(loop, 1, axis=0), axis=1).sum()) for loop in loops
+    )
 
 
 def _heights(request: TraceRequest, count: int) -> list[float | None]:
@@ -265,7 +319,14 @@ def _write(
             outlines_svg(outlines),
             outlines_dxf(outlines),
         )
-    files["trace.png"] = trace_png(cv2, seen, silhouette, outlines, request.photo.name)
+    files["trace.png"] = trace_png(
+        cv2,
+        seen,
+        silhouette,
+        outlines,
+        [item.place for tool in tools for item in tool.doubts],
+        request.photo.name,
+    )
     folder = require_folder(request.output)
     for file, content in files.items():
         write_atomically(folder / file, content)
@@ -285,6 +346,10 @@ def _write(
                     "size_mm": np.round(tool.size_mm, 2).tolist(),
                     "holes": tool.holes,
                     "height_mm": tool.height_mm,
+                    "doubts": [
+                        {"place_mm": np.round(item.place, 1).tolist(), "area_mm2": round(item.area)}
+                        for item in tool.doubts
+                    ],
                 }
                 for tool in tools
             ],

@@ -148,6 +148,26 @@ def test_points_correct_the_outline(tmp_path: Path):
         traced(path, points=points)
 
 
+def test_an_outline_that_may_be_wrong_is_in_doubt_until_its_user_settles_it(tmp_path: Path):
+    assert not traced(photo_of(tmp_path, spanner())).tools[0].doubts
+    # Steel as light as the shadow beside it.
+    pale = PlacedTool(SPANNER.translate((90, 100)), 14, ("steel", "steel"))
+    path = photo_of(tmp_path, pale, shadow=0.5, light=(0.9, -0.9), softness=0.2, seed=2)
+    (tool,) = traced(path).tools
+    assert tool.doubts
+    places = [item.place for item in tool.doubts]
+    silhouette = SPANNER.translate((90, 100)).offset(25.0)
+    for x, y in places:
+        assert not (silhouette ^ CrossSection.square((1, 1)).translate((x, y))).is_empty()
+    record = json.loads((tmp_path / "out/trace.json").read_text())
+    assert len(record["tools"][0]["doubts"]) == len(places)
+    points = tmp_path / "points.yaml"
+    points.write_text("- remove: [[0, 0], [297, 0], [297, 60], [0, 60]]\n")
+    assert traced(path, points=points).tools[0].doubts
+    points.write_text("- add: [[60, 70], [240, 70], [240, 130], [60, 130]]\n")
+    assert not traced(path, points=points).tools[0].doubts
+
+
 def test_two_points_or_a_coin_give_the_scale_without_a_sheet(tmp_path: Path):
     coin = PlacedTool(CrossSection.circle(12.875, 200).translate((380, 280)), 2.0, ("red", "red"))
     path = photo_of(tmp_path, spanner(x=280, y=330), coin, sheet=(700.0, 600.0), distance=400.0)
