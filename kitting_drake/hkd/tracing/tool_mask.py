@@ -111,12 +111,12 @@ class ToolMasks:
         free = (self._steep < look.steep * noise) & (self._colour < _COLOURED * noise)
         free &= (self._lightness > -_NO_SHADOW) & (self._lightness < _BRIGHTER * noise)
         free |= ~ground
-        limit = max(_ROUGH * look.rough / 3, look.rough * self._usual)
-        even = (free & (self._rough < limit)) | ~ground
+        roughest = max(_ROUGH * look.rough / 3, look.rough * self._usual)
+        even = (free & (self._rough < roughest)) | ~ground
         reached = _reached(cv2, even, self._plain, px_per_mm)
         # A hole may lie wholly in shadow, so its edges are close.
-        limit = 1.7 * _median(self._fine[self._plain & ground], _ROUGH)
-        limit = limit * np.exp(-self._lightness / 2)
+        usual = _median(self._fine[self._plain & ground], _ROUGH)
+        limit = 1.7 * usual * np.exp(-self._lightness / 2)
         like_ground = (self._colour < _NEUTRAL * noise) & (self._fine < limit)
         shaded = free & (self._fine < 2 * limit) & ~reached
         reached |= _shaded_holes(cv2, shaded, like_ground, px_per_mm)

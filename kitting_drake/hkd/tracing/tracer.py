@@ -229,11 +229,8 @@ def _doubts(parts: list[CrossSection], unclear: list[Unclear]) -> list[tuple[Unc
     result = []
     for i, (part, items) in enumerate(zip(parts, near, strict=True)):
         matters = sum(item.area for item in items) > _DOUBTED_MM * _perimeter(part)
-        split = [
-            item
-            for j, other in enumerate(parts)
-            if j != i and (item := _gap_between(part, other)) is not None
-        ]
+        gaps = [_gap_between(part, other) for j, other in enumerate(parts) if j != i]
+        split = [gap for gap in gaps if gap is not None]
         result.append(tuple([*split, *(items if matters else [])][:_MOST_DOUBTS]))
     return result
 
