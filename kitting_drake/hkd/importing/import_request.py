@@ -44,7 +44,7 @@ class ImportRequest:
     """The height in mm to which an outline is extruded. A mesh has none."""
     frame: str | None = None
     """What a rectangle around the rest of an outline is, one of `closed_curves.FRAMES`; None
-    judges, or asks."""
+    decides it where it is clear."""
 
     @property
     def given_density(self) -> float | None:

@@ -47,7 +47,8 @@ def read_drawing(path: Path, unit_mm: float | None = None, frame: str | None = N
         path: the path of the drawing.
         unit_mm: the length in mm of a unit of the drawing; None takes the unit from the file (see
             `svg_curves` and `dxf_curves`).
-        frame: what a rectangle around all else is, `page` or `tool`; None judges, or asks.
+        frame: what a rectangle around all else is, `page` or `tool`; None decides it where it is
+            clear.
 
     Raises:
         UserError: the file is missing or not a drawing, its size is unknown, a curve is open, or

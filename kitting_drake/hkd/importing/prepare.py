@@ -19,6 +19,7 @@ from kitting_drake.hkd.importing.import_request import ImportRequest
 from kitting_drake.hkd.importing.materials import bodies_of, weighed
 from kitting_drake.hkd.importing.outline import extruded, is_outline, laid_along_x, read_drawing
 from kitting_drake.hkd.importing.reading import drawn_curves
+from kitting_drake.hkd.importing.reading.closed_curves import FrameError
 from kitting_drake.hkd.importing.reading.mesh_files import IN_MM, read_mesh
 from kitting_drake.hkd.importing.reading.outline_picture import holes_text, write_outline_picture
 from kitting_drake.hkd.importing.repair import NOMINAL_MM, make_solid
@@ -152,6 +153,8 @@ def _surface(request: ImportRequest) -> tuple[np.ndarray, np.ndarray, list[str]]
     unit_mm = None if request.unit is None else drawn_curves.UNITS_MM[request.unit]
     try:
         drawing = read_drawing(request.mesh, unit_mm, request.frame)
+    except FrameError:
+        raise
     except UserError:
         # The unit does not matter for a drawing that is scaled to a given length.
         if request.length_mm is None or unit_mm is not None:

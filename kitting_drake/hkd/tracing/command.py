@@ -13,6 +13,7 @@ from kitting_drake.hkd.listing import size_text
 
 if TYPE_CHECKING:
     from kitting_drake.hkd.tracing.scales import Scale
+    from kitting_drake.hkd.tracing.tracer import TracedTool
 
 
 def describe_trace(tracer: argparse.ArgumentParser) -> None:
@@ -100,6 +101,21 @@ def _describe_scales(scales: "argparse._ArgumentGroup") -> None:
     )
 
 
+def _print_tool(console: Console, tool: "TracedTool") -> None:
+    size = " x ".join(f"{side:.1f}" for side in tool.size_mm)
+    holes = "1 hole" if tool.holes == 1 else f"{tool.holes or 'no'} holes"
+    console.print(f"{tool.name}: {size} mm, {holes}")
+    if not tool.doubts:
+        return
+    places = ", ".join(f"({x:.0f}, {y:.0f})" for x, y in (item.place for item in tool.doubts))
+    console.print(
+        f"  DOUBT: its outline may be wrong near {places} mm, where tool, shine and shadow look "
+        "alike: see the red circles in trace.png, and mend it with --points or take the photo in "
+        "softer light",
+        soft_wrap=True,
+    )
+
+
 def trace_photo(args: argparse.Namespace) -> None:
     """Traces a photo and prints what was found; imports the tools on request.
 
@@ -127,19 +143,7 @@ def trace_photo(args: argparse.Namespace) -> None:
     with Console(stderr=True, quiet=args.quiet).status(f"tracing {escape(str(args.photo))}"):
         report = trace(request)
     for tool in report.tools:
-        size = " x ".join(f"{side:.1f}" for side in tool.size_mm)
-        holes = "1 hole" if tool.holes == 1 else f"{tool.holes or 'no'} holes"
-        console.print(f"{tool.name}: {size} mm, {holes}")
-        if tool.doubts:
-            places = ", ".join(
-                f"({x:.0f}, {y:.0f})" for x, y in (item.place for item in tool.doubts)
-            )
-            console.print(
-                f"  DOUBT: its outline may be wrong near {places} mm, where tool, shine and shadow "
-                "look alike: see the red circles in trace.png, and mend it with --points or take "
-                "the photo in softer light",
-                soft_wrap=True,
-            )
+        _print_tool(console, tool)
     for note in report.notes:
         console.print(f"  {note}", soft_wrap=True)
     console.print(f"look at {args.output}/trace.png before you cut", soft_wrap=True)

@@ -24,7 +24,7 @@ class Corrections:
     found automatically."""
 
     def settles(self, place: tuple[float, float]) -> bool:
-        """Whether a polygon holds a place, in mm, so that the user has looked at it."""
+        """Whether a place (x, y), in mm, lies in a polygon, so the user has judged it."""
         spot = CrossSection.square((0.1, 0.1), True).translate(place)
         return any(
             not (CrossSection([points], FillRule.EvenOdd) ^ spot).is_empty()

@@ -22,7 +22,7 @@ _LEAST_LOOP_MM2 = 4.0
 _LEAST_TOOL_MM2 = 60.0
 _FLAT_MM = 0.03
 _EDGE_SLACK_MM = 0.4
-"""Two looks at an edge may be twice this apart."""
+"""Half the width in mm of a strip that is ignored where two looks differ."""
 
 
 @dataclass(frozen=True)
@@ -30,9 +30,9 @@ class Unclear:
     """A region that may be tool, or may be ground or shadow."""
 
     place: tuple[float, float]
-    """Its middle, in mm."""
+    """Its centroid (x, y), in mm."""
     area: float
-    """In mm^2."""
+    """Its area, in mm^2."""
 
 
 def find_silhouettes(
@@ -50,10 +50,11 @@ def find_silhouettes(
         sheet: (2,) the size of the sheet, whose lower left corner is the origin. The tools lie on
             it. None: the whole photo is ground.
         hidden: polygons to leave out.
-        height: of the lowest tool, in mm, if it is known.
+        height: the height of the lowest tool, in mm; None: unknown.
 
     Returns:
-        The area in mm, the width of the blur of its border in mm, and what is not clear.
+        The area in mm, the width of the blur of its border in mm, and the unclear regions, the
+        largest first.
 
     Raises:
         UserError: a tool extends beyond the sheet's edge.
@@ -67,7 +68,7 @@ def find_silhouettes(
         ground &= ~_polygon(cv2, photo, polygon)
     ratio, spread = flattened(cv2, logs, ground, ppm)
     masks = ToolMasks(cv2, ratio, ground, spread, ppm)
-    mask = masks.mask(look_for(height))
+    mask = masks.mask(look_for(height, ppm))
     if sheet is not None:
         inner = _polygon(cv2, photo, _rectangle(_RIM_MM + 0.5, sheet - _RIM_MM - 0.5))
         if mask[~inner].any():
@@ -85,7 +86,7 @@ def find_silhouettes(
 
 
 def _unclear(cv2: Any, photo: RectifiedPhoto, differ: Array) -> list[Unclear]:
-    """The regions that may be tool or ground, the largest first."""
+    """Returns the regions of a mask (rows, columns) that are not narrow, the largest first."""
     ppm = photo.px_per_mm
     radius = max(1, round(_EDGE_SLACK_MM * ppm))
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))

@@ -26,7 +26,8 @@ _SHINE_STEEP = 0.6
 """The largest slope of the edge of a specular reflection, in logarithms of light per mm."""
 _STEP_REACH_MM = 1.5
 _SHINY, _SHINY_SHARE = 0.06, 0.25
-"""Where more than this share is brighter than the ground, in logarithms of light, is no ground."""
+"""A bay is shine if more than this share of it is this much brighter than the ground, in logarithms
+of light."""
 _SHINE_REACH_MM = 3.0
 _BAY_MM = 12.0
 """Half the width, in mm, below which a bright band with soft edges across a tool is a
@@ -42,31 +43,40 @@ _LEAST_HOLE_RADIUS_MM = 0.7
 
 @dataclass(frozen=True)
 class ShadowLook:
-    """How readily a shadow is seen to go on."""
+    """The limits by which shadows are told from tools."""
 
     steep: float
     """A steeper step of the logarithm of light, per mm, is not the edge of a shadow."""
     rough: float
-    """What is rougher than the plain ground by more than this factor is not a shadow."""
+    """A shadow is rougher than the plain ground by at most this factor."""
     shine: float
-    """A bay or hole whose border is wider than this, in mm, on three tenths of it is shine."""
+    """A bay or hole is shine if the step of light is wider than this, in mm, on 30 % of its
+    border."""
 
 
 CAREFUL = ShadowLook(0.3, 2.0, 1.2)
-"""Takes faint edges for those of tools. The edge of a low tool's shadow may be as sharp."""
+"""Takes faint edges for edges of tools. The shadows of low tools have sharper edges."""
 MIDDLE = ShadowLook(0.45, 3.0, 1.2)
 BOLD = ShadowLook(0.65, 4.0, math.inf)
-"""Follows shadows over faint edges. What only one of two looks takes for a tool is not clear."""
+"""Follows shadows over faint edges. Where it differs from another look, the outline is in doubt."""
 _LOW_MM = 9.0
+_COARSE_PX_PER_MM = 3.5
+_FINE_PX_PER_MM = 5.0
+"""Below this resolution, blurred pixels widen the steps of light."""
 
 
-def look_for(height: float | None) -> ShadowLook:
-    """The look that suits tools of a height in mm; None: not known."""
-    return MIDDLE if height is None or height < _LOW_MM else CAREFUL
+def look_for(height: float | None, px_per_mm: float) -> ShadowLook:
+    """Returns the look that suits tools of a height in mm, or of an unknown one (None).
+
+    In a coarse photo a shadow's edge beside a tool is as rough as a tool.
+    """
+    if height is None or height < _LOW_MM or px_per_mm < _COARSE_PX_PER_MM:
+        return MIDDLE
+    return CAREFUL
 
 
 class ToolMasks:
-    """Tells tools from the ground of one photo, by one look or another."""
+    """Separates the tools in one photo from the ground, by one look or another."""
 
     def __init__(
         self, cv2: Any, ratio: Array, ground: Array, spread: float, px_per_mm: float
@@ -75,8 +85,9 @@ class ToolMasks:
 
         Args:
             cv2: OpenCV.
-            ratio, spread: from `ground_light.flattened`.
-            ground: (rows, columns) where tools may be.
+            ratio: (rows, columns, 3) the logarithms from `ground_light.flattened`.
+            ground: (rows, columns) true where tools may be.
+            spread: the standard deviation from `ground_light.flattened`.
             px_per_mm: the resolution.
         """
         self._cv2, self._ground, self._px_per_mm = cv2, ground, px_per_mm
@@ -126,10 +137,11 @@ class ToolMasks:
             grown = cv2.dilate(reached.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
             reached |= grown & free
         tool = _components(cv2, (~reached).astype(np.uint8), self._evidence, px_per_mm)
-        return self._bordered(self._without_shine(tool, look.shine))
+        widest = look.shine * max(1.0, _FINE_PX_PER_MM / px_per_mm)
+        return self._bordered(self._without_shine(tool, widest))
 
     def shine(self, mask: Array) -> Array:
-        """(rows, columns) 1 beside a mask where it is brighter than ground can be."""
+        """Returns a mask (rows, columns): 1 beside a given one where no ground is as bright."""
         cv2 = self._cv2
         near = cv2.dilate(mask, _disc(cv2, _SHINE_REACH_MM * self._px_per_mm))
         bright = (self._lightness > 2 * _SHINY * self._noise) & self._ground
@@ -163,7 +175,7 @@ class ToolMasks:
         return filled
 
     def _bordered(self, tool: Array) -> Array:
-        """A mask whose border is moved to the steepest step nearby."""
+        """Moves the border of a mask to the steepest step nearby."""
         cv2, px_per_mm = self._cv2, self._px_per_mm
         markers = np.zeros(tool.shape, np.int32)
         markers[cv2.dilate(tool, _disc(cv2, 0.4 * px_per_mm)) == 0] = 1
@@ -235,7 +247,7 @@ def _shaded_holes(cv2: Any, even: Array, like_ground: Array, px_per_mm: float) -
 
 
 def _closed(cv2: Any, mask: Array, radius: float, px_per_mm: float) -> Array:
-    """A mask closed by a large disc, at a coarser resolution, which is faster."""
+    """Closes a mask by a large disc, at a coarser resolution, which is faster."""
     rows, columns = mask.shape
     factor = max(1, int(px_per_mm / 1.5))
     margin = math.ceil(radius / factor) + 2

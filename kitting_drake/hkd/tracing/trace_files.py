@@ -79,8 +79,8 @@ def trace_png(
     Args:
         cv2: OpenCV.
         photo: the plane from above.
-        silhouette: as seen, in mm.
-        outlines: of each tool, in mm.
+        silhouette: the area that the tools hide, in mm.
+        outlines: the outline of each tool by its name, in mm.
         doubts: places, in mm, where an outline may be wrong.
         caption: a line above the picture.
     """

@@ -37,10 +37,11 @@ _HEIGHTS_MM = (0.5, 100.0)
 _CAMERAS_MM = (100.0, 3000.0)
 _SHARE_OF_HEIGHT = 0.5
 _DOUBTED_MM = 0.12
-"""An outline is in doubt if what is not clear has a larger area than its length times this."""
+"""An outline is in doubt if the area that is not clear, divided by the outline's length, exceeds
+this, in mm."""
 _MOST_DOUBTS = 4
 _APART_MM = 15.0
-"""Silhouettes closer than this may be of one tool."""
+"""Silhouettes closer than this, in mm, may be of one tool."""
 
 
 @dataclass(frozen=True)
@@ -120,7 +121,6 @@ def trace(request: TraceRequest) -> TraceReport:
     )
     _check_view(photo, plane)
     seen, silhouette, blur, unclear = _look(cv2, photo, plane, request.heights_mm)
-    unclear = [item for item in unclear if not corrections.settles(item.place)]
     silhouette = corrections.applied(silhouette)
     parts = [part for part in silhouette.decompose() if part.area() > 0]
     parts.sort(key=lambda part: part.bounds()[0])
@@ -128,7 +128,7 @@ def trace(request: TraceRequest) -> TraceReport:
     heights = _heights(request, len(parts))
     names = [name] if len(parts) == 1 else [f"{name}_{i + 1}" for i in range(len(parts))]
     tools = []
-    doubts = _doubts(parts, unclear)
+    doubts = _doubts(parts, unclear, corrections)
     for part, height, own, doubtful in zip(parts, heights, names, doubts, strict=True):
         outline = part
         if height is not None:
@@ -216,10 +216,15 @@ def _check_parts(
                 )
 
 
-def _doubts(parts: list[CrossSection], unclear: list[Unclear]) -> list[tuple[Unclear, ...]]:
-    """For each silhouette, what is not clear of it, the largest first, if it matters."""
+def _doubts(
+    parts: list[CrossSection], unclear: list[Unclear], corrections: Corrections
+) -> list[tuple[Unclear, ...]]:
+    """Returns, for each silhouette, the places where it may be wrong: gaps to close neighbours,
+    and then what is not clear, the largest first. Corrected places do not count."""
     near: list[list[Unclear]] = [[] for _ in parts]
     for item in unclear:
+        if corrections.settles(item.place):
+            continue
         square = CrossSection.square((1.0, 1.0), True).translate(item.place)
         away = [
             CrossSection.batch_hull([part.hull(), square]).area() - part.hull().area()
@@ -230,13 +235,14 @@ def _doubts(parts: list[CrossSection], unclear: list[Unclear]) -> list[tuple[Unc
     for i, (part, items) in enumerate(zip(parts, near, strict=True)):
         matters = sum(item.area for item in items) > _DOUBTED_MM * _perimeter(part)
         gaps = [_gap_between(part, other) for j, other in enumerate(parts) if j != i]
-        split = [gap for gap in gaps if gap is not None]
+        split = [gap for gap in gaps if gap is not None and not corrections.settles(gap.place)]
         result.append(tuple([*split, *(items if matters else [])][:_MOST_DOUBTS]))
     return result
 
 
 def _gap_between(part: CrossSection, other: CrossSection) -> Unclear | None:
-    """The gap between two silhouettes that are so close that shine may have split one tool."""
+    """Returns the gap between two silhouettes that are so close that shine may have split one
+    tool; None if they are not."""
     grown = _APART_MM / 2
     bridge = part.offset(grown, JoinType.Round) ^ other.offset(grown, JoinType.Round)
     if bridge.is_empty():

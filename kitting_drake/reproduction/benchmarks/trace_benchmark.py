@@ -39,6 +39,7 @@ TOOLS = (
 HEIGHTS_MM = (5.0, 12.0, 20.0)
 TILTS = (4.0, 15.0, 25.0)
 GAP_MM = 2.0
+"""The width of gaps that `gapless` errors leave out."""
 _SAMPLE_MM = 0.25
 _SEEDS_APART = 10_000
 
@@ -54,15 +55,15 @@ def benchmark_trace(
 ) -> dict[str, Any]:
     """Draws three photos of each tool, traces them and measures the outlines, in mm.
 
-    Outlines that are given without a doubt are also measured apart. `gapless` errors leave out
-    gaps narrower than `GAP_MM`, which a tool's sides hide, and which its cavity bridges.
+    Outlines without a doubt are also measured apart. A tool's sides hide narrow gaps, and its
+    cavity bridges them, so there are also errors without gaps below `GAP_MM`.
 
     Args:
-        names: of the tools.
-        console: where to show progress.
-        folder: where to keep photos and pictures; None: nowhere.
-        exif: whether the photos tell their focal length.
-        seed: draws other photos.
+        names: the names of the tools.
+        console: the console for the progress.
+        folder: the folder in which to keep photos and pictures; None keeps none.
+        exif: whether the photos state their focal length.
+        seed: the seed of the photos.
     """
     photos: list[dict[str, Any]] = []
     pooled: list[tuple[bool, Points, Points]] = []
@@ -106,7 +107,10 @@ def benchmark_trace(
 def drawn_case(
     name: str, index: int, k: int, exif: bool, seed: int = 0
 ) -> tuple[PhotoSpec, PlacedTool]:
-    """The k-th photo of a tool: three heights and tilts, both grounds, light from all sides."""
+    """Draws the conditions of the k-th photo of a tool.
+
+    They cover three heights and tilts, both grounds, and light from all sides.
+    """
     index += _SEEDS_APART * seed
     rng = np.random.default_rng(1000 + index)
     lamp = rng.uniform(0, 2 * math.pi)
@@ -197,7 +201,7 @@ def _length(outline: CrossSection) -> float:
 
 
 def _gapless(outline: CrossSection) -> CrossSection:
-    """An outline with gaps narrower than `GAP_MM` closed."""
+    """Closes the gaps of an outline that are narrower than `GAP_MM`."""
     grown = outline.offset(GAP_MM / 2, JoinType.Round, circular_segments=32)
     return grown.offset(-GAP_MM / 2, JoinType.Round, circular_segments=32)
 
@@ -225,7 +229,7 @@ def _summary(
 
 
 def _pooled(errors: list[tuple[Points, Points]]) -> dict[str, float] | None:
-    """Median and 95th percentile of the errors of several outlines, with and without gaps."""
+    """Returns the median and the 95th percentile of the errors of several outlines."""
     if not errors:
         return None
     whole, gapless = (np.concatenate(part) for part in zip(*errors, strict=True))

@@ -22,6 +22,8 @@ PAPERS_MM = (
     ("Tabloid", 279.4, 431.8),
 )
 """Names of sheets of paper, and their sides in mm."""
+FRAMES = ("page", "tool")
+"""What a rectangle around the rest of a drawing may be."""
 
 _JOIN_MM = 0.1
 """The largest gap between the ends of two curves that are joined, in mm."""
@@ -32,20 +34,22 @@ _SAME_MM = 0.05
 _LEAST_AREA_MM2 = 1.0
 _LINE_MM = 1.5
 """The width in mm below which two outlines count as the two sides of one thick line."""
-FRAMES = ("page", "tool")
-"""What a rectangle around the rest of a drawing may be."""
-
 _BOX = 0.9
 """A rectangle, also one with round corners, fills at least this share of its bounds."""
-_THE_PAGE, _PAGE = "the page", 0.85
-"""The page's rectangle has at least this share of its sides."""
-# A rectangle around a curve as long as the second share of it is a frame if that curve has holes.
-# A curve shorter than the first share of it is a hole. Others are a question.
-_SHORT, _LONG = 0.25, 0.4
+_THE_PAGE = "the page"
+_PAGE = 0.85
+"""The least share of the page's sides that a rectangle of the page has."""
+_HOLE, _TOOL = 0.25, 0.4
+"""Shares of a rectangle's length. A curve in it that is shorter than the first is a hole; one that
+is longer than the second may be a tool."""
 _ROUND = 0.02
-"""The largest difference of a round hole from a circle."""
+"""The largest relative difference of a round hole from a circle."""
 
 Points = NDArray[np.float64]
+
+
+class FrameError(UserError):
+    """A rectangle may be a frame, or the tool."""
 
 
 @dataclass(frozen=True)
@@ -54,11 +58,11 @@ class _Loop:
 
     area: CrossSection
     element: int | None
-    """As of `Curve`."""
+    """The number of its filled element, as in `Curve`."""
 
     @property
     def size(self) -> Points:
-        """Its sides along x and y."""
+        """The lengths (2,) of its sides along x and y, in mm."""
         x_min, y_min, x_max, y_max = self.area.bounds()
         return np.array([x_max - x_min, y_max - y_min])
 
@@ -82,11 +86,12 @@ def enclosed(
     Args:
         drawn: the curves.
         path: the drawing, for messages.
-        frame: one of `FRAMES`; None judges a rectangle around all else.
+        frame: what a rectangle around all else is, one of `FRAMES`; None decides it where it is
+            clear.
 
     Raises:
-        UserError: a curve is open, or crosses itself, or is not inside the largest one, or that may
-            be a frame.
+        FrameError: the largest curve may be a frame.
+        UserError: a curve is open, crosses itself, or is not inside the largest curve.
     """
     notes: list[str] = []
     loops = [
@@ -126,16 +131,16 @@ def enclosed(
 def _as_frame(
     loops: list[_Loop], page_mm: tuple[float, float] | None, path: Path, frame: str | None
 ) -> str | None:
-    """Describes the largest curve if it is a page or a frame; None if it is the tool itself.
+    """Describes the largest curve if it is a page or a frame; returns None if it is the tool.
 
     Args:
         loops: closed curves, the largest first; at least two.
         page_mm: the size of the page, where the drawing has one.
         path: the drawing, for messages.
-        frame: as of `enclosed`.
+        frame: as in `enclosed`.
 
     Raises:
-        UserError: it may be either.
+        FrameError: it may be either.
     """
     box, inside, *others = loops
     sides = box.size
@@ -161,24 +166,24 @@ def _as_frame(
         other.area.area() < 0.98 * inside.area.area() and inside.holds(other) for other in others
     )
     if sides.max() > LONGEST_MM:
-        return f"{size}, {page or 'a frame'}," if share >= _LONG else None
+        return f"{size}, {page or 'a frame'}," if share >= _TOOL else None
     # Lines as large as the page may be those of a tool that the page was fitted to.
     is_ground = page is not None and (
         page != _THE_PAGE or None not in (box.element, inside.element)
     )
-    if share >= _LONG and (has_holes or (is_ground and not inside.is_round)):
+    if share >= _TOOL and (has_holes or (is_ground and not inside.is_round)):
         return f"{size}, {page or 'a frame'},"
-    if share < _SHORT or inside.is_round:
+    if share < _HOLE or inside.is_round:
         return None
     inner = f"{inside.size[0]:.0f} x {inside.size[1]:.0f} mm"
-    raise UserError(
+    raise FrameError(
         f"{path} has {size} around a curve of {inner}: give --frame page if the tool is what is "
         "inside, or --frame tool if it is the rectangle, with a hole"
     )
 
 
 def _page_of(sides: Points, page_mm: tuple[float, float] | None) -> str | None:
-    """Which page is as large as a rectangle, if one is."""
+    """Names the page that is as large as a rectangle with these sides (2,), if one is."""
     share = np.zeros(2) if page_mm is None else sides / page_mm
     if ((share >= _PAGE) & (share <= 1 / _PAGE)).all():
         return _THE_PAGE
@@ -189,7 +194,7 @@ def _page_of(sides: Points, page_mm: tuple[float, float] | None) -> str | None:
 
 
 def _joined(drawn: DrawnCurves, path: Path, notes: list[str]) -> list[tuple[Points, int | None]]:
-    """Joins curves whose ends meet into closed curves; with the element of each.
+    """Joins curves whose ends meet into closed curves; also returns the element of each.
 
     Raises:
         UserError: a curve stays open.

@@ -28,7 +28,8 @@ class Curve:
     filled: bool = False
     """Whether the drawing fills the curve. A filled curve looks closed even if it is open."""
     element: int | None = None
-    """The number of the filled element that it is a part of, so that others of it are holes."""
+    """The number of the filled element that it is a part of; others of that element are holes.
+    None: not filled, or not known."""
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """Reads the curves of DXF files."""
 
+import re
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,9 @@ _SMOOTHED, _CONTROL_POINT = 4, 16
 _MORE_UNITS_MM = {8: 25.4e-6, 9: 0.0254, 21: 1200 / 3937 * 1e3, 22: 100 / 3937 * 1e3}
 """Values of $INSUNITS that ezdxf does not convert: microinches, mils, US survey feet and inches."""
 
+_END_MARK, _TAIL = re.compile(rb"^\s*EOF\b", re.MULTILINE), 1000
+"""The end mark of a DXF; some programs write more bytes behind it."""
+
 
 def dxf_curves(path: Path, unit_mm: float | None = None) -> DrawnCurves:
     """Reads the curves in a DXF's model space that are plotted.
@@ -35,11 +39,7 @@ def dxf_curves(path: Path, unit_mm: float | None = None) -> DrawnCurves:
     )
     try:
         document = _document(ezdxf, path)
-        hidden = {
-            layer.dxf.name.lower()
-            for layer in document.layers
-            if layer.is_off() or layer.is_frozen() or not layer.dxf.get("plot", 1)
-        } | {"defpoints"}
+        hidden = _hidden_layers(document)
         unseen = 0
 
         def is_drawn(entity: Any) -> bool:
@@ -83,22 +83,29 @@ def dxf_curves(path: Path, unit_mm: float | None = None) -> DrawnCurves:
 
 
 def _document(ezdxf: Any, path: Path) -> Any:
-    """Reads a DXF; one whose writer left out the end of the file is complete, too.
+    """Reads a DXF. A file that lacks only the end mark is complete.
 
     Raises:
-        UserError: it is cut short.
+        UserError: the file is cut short.
     """
     data = path.read_bytes()
-    is_text = not data.startswith(b"AutoCAD Binary DXF")
-    last = data.split()[-1:]
-    if is_text and last != [b"EOF"]:
-        if last != [b"ENDSEC"]:
-            raise UserError(f"{path} is cut short or not a DXF: copy or export it again")
-        with tempfile.TemporaryDirectory() as scratch:
-            whole = Path(scratch) / "whole.dxf"
-            whole.write_bytes(data.rstrip() + b"\n0\nEOF\n")
-            return ezdxf.readfile(whole)
-    return ezdxf.readfile(path)
+    if data.startswith(b"AutoCAD Binary DXF") or _END_MARK.search(data[-_TAIL:]):
+        return ezdxf.readfile(path)
+    if data.rsplit(None, 1)[-1:] != [b"ENDSEC"]:
+        raise UserError(f"{path} is cut short or not a DXF: copy or export it again")
+    with tempfile.TemporaryDirectory() as scratch:
+        whole = Path(scratch) / "whole.dxf"
+        whole.write_bytes(data.rstrip() + b"\n0\nEOF\n")
+        return ezdxf.readfile(whole)
+
+
+def _hidden_layers(document: Any) -> set[str]:
+    """Returns the names, in lower case, of the layers that are not plotted."""
+    return {
+        layer.dxf.name.lower()
+        for layer in document.layers
+        if layer.is_off() or layer.is_frozen() or not layer.dxf.get("plot", 1)
+    } | {"defpoints"}
 
 
 def _drop_control_points(entity: Any) -> None:

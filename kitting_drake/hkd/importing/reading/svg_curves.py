@@ -74,7 +74,7 @@ def svg_curves(path: Path, unit_mm: float | None = None) -> DrawnCurves:
 
 
 def _filling(shape: Any, number: int) -> tuple[bool, int | None]:
-    """Whether a shape is filled, and its number if it is."""
+    """Returns whether a shape is filled, and its number if it is."""
     filled = _is_painted(shape.fill)
     return filled, number if filled else None
 
@@ -84,7 +84,7 @@ def _is_painted(colour: Any) -> bool:
 
 
 def _read_style(root: ElementTree.Element) -> None:
-    """Takes the width and height of the root element from its style if it has no others."""
+    """Copies the width and height in the root element's style to its attributes, if missing."""
     for name in ("width", "height"):
         found = re.search(rf"(?:^|;)\s*{name}\s*:\s*([^;]+)", root.get("style", ""))
         if found and name not in root.attrib:

@@ -192,6 +192,18 @@ def test_the_length_does_not_depend_on_the_drawings_rotation(tmp_path: Path):
         bring(drawing(tmp_path, '<rect width="9" height="5"/>'), height_mm=12.0)
 
 
+def test_a_scaled_drawing_still_asks_whether_its_rectangle_is_a_frame(tmp_path: Path):
+    # In units of the viewBox, the rectangle is longer than any tool.
+    path = tmp_path / "tool.svg"
+    path.write_text(
+        '<svg xmlns="http://www.w3.org/2000/svg" width="200mm" viewBox="0 0 1000 400">'
+        '<path d="M25 25h950v300h-950z" fill="none" stroke="#000"/>'
+        '<path d="M100 100h800v100h-800z"/></svg>'
+    )
+    with pytest.raises(UserError, match="--frame page"):
+        bring(path, height_mm=12.0, length_mm=150.0)
+
+
 def test_outlines_need_a_height_and_meshes_must_not_have_one(tmp_path: Path):
     path = drawing(tmp_path, BAR)
     with pytest.raises(UserError, match="--height_mm"):

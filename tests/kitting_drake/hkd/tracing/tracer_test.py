@@ -168,6 +168,21 @@ def test_an_outline_that_may_be_wrong_is_in_doubt_until_its_user_settles_it(tmp_
     assert not traced(path, points=points).tools[0].doubts
 
 
+def test_close_neighbours_may_be_one_tool_until_their_gap_is_corrected(tmp_path: Path):
+    bars = [
+        PlacedTool(CrossSection.square((120, 20)).translate((90, y)), 8, ("red", "red"))
+        for y in (80, 110)
+    ]
+    path = photo_of(tmp_path, *bars)
+    lower, upper = traced(path, heights_mm=(8.0,)).tools
+    (gap,) = upper.doubts
+    assert gap.place == pytest.approx((150, 105), abs=3)
+    assert lower.doubts == upper.doubts
+    points = tmp_path / "points.yaml"
+    points.write_text("- remove: [[80, 103], [220, 103], [220, 107], [80, 107]]\n")
+    assert not any(tool.doubts for tool in traced(path, heights_mm=(8.0,), points=points).tools)
+
+
 def test_two_points_or_a_coin_give_the_scale_without_a_sheet(tmp_path: Path):
     coin = PlacedTool(CrossSection.circle(12.875, 200).translate((380, 280)), 2.0, ("red", "red"))
     path = photo_of(tmp_path, spanner(x=280, y=330), coin, sheet=(700.0, 600.0), distance=400.0)

@@ -152,8 +152,10 @@ def test_a_drawing_without_a_unit_is_in_mm_or_as_asked(header: str, tmp_path: Pa
 
 def test_a_missing_end_is_not_a_missing_part(tmp_path: Path):
     whole = box(tmp_path / "tool.dxf", 1.0, 1).read_text()
-    (tmp_path / "tool.dxf").write_text("999\nby a program\n" + whole.removesuffix("0\nEOF\n"))
-    assert read_drawing(tmp_path / "tool.dxf").outline.area() == pytest.approx(3200, rel=1e-3)
+    # Without the end mark, and with the end-of-file byte of DOS behind it.
+    for text in ("999\nby a program\n" + whole.removesuffix("0\nEOF\n"), whole + "\x1a"):
+        (tmp_path / "tool.dxf").write_text(text)
+        assert read_drawing(tmp_path / "tool.dxf").outline.area() == pytest.approx(3200, rel=1e-3)
     (tmp_path / "tool.dxf").write_text(whole[: -len("0\nENDSEC\n0\nEOF\n")])
     with pytest.raises(UserError, match="cut short"):
         read_drawing(tmp_path / "tool.dxf")
