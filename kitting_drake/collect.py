@@ -170,7 +170,7 @@ class _Export:
 
     @staticmethod
     def of(arguments: argparse.Namespace, chosen: ChosenScenario, folder: Path) -> "_Export":
-        """Checks the flags before anything is written.
+        """Makes the export that the flags ask for. Checks the flags before anything is written.
 
         Raises:
             UserError: a flag cannot be used, or pyarrow is not installed.

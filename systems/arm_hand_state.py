@@ -25,6 +25,8 @@ class ArmHandState(LeafSystem):
     - `robot_state` (18): positions of the seven joints and both fingers, then their velocities.
     - `hand_state` (12): positions then velocities of (x, y, z, yaw, left finger, right finger).
 
+    All values are in m, rad and s.
+
     Stateless.
     """
 

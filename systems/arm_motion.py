@@ -304,7 +304,7 @@ class ArmMotion(JawMotion):
         state.duration = self._way(state).duration
 
     def motion_at(self, state: PlannerState, time: float) -> NDArray[np.float64]:
-        """(21) the joints' desired positions, velocities and accelerations."""
+        """(21) the joints' desired positions, velocities and accelerations, in rad and s."""
         assert isinstance(state, ArmState)
         return self._way(state).at(time - state.way_start)
 

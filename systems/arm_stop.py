@@ -60,7 +60,8 @@ class ArmStop:
             jerk = np.maximum(jerk / (1.02 * excess), 1.0)
 
     def _torque_rates(self, inertia: ArmInertia) -> NDArray[np.float64]:
-        """(n, 7) largest rates of the torques M a near each switch, in N m/s: M j + M' a."""
+        """(n, 7) largest rates of the joint torques M a, in N m/s, one row for each interval of
+        constant jerk j. The rates are M j + M' a."""
         lasts = np.diff(self._times)[:, None]
         q, _, a = np.moveaxis(self._states, 1, 0)
         jerk = np.diff(a, axis=0) / lasts

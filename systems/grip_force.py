@@ -8,8 +8,8 @@ GRAVITY = 9.81
 """Acceleration of gravity, in m/s^2."""
 
 _TOO_EARLY = 1.5
-"""If the grip force should be more than this factor larger, the object is not lifted until it is.
-"""
+"""If the required grip force is more than this factor times the present one, the lift waits until
+the force has risen."""
 _EASY_MOMENT = 0.18
 """A moment about the axis of the pads that friction holds easily, in N m."""
 _MOMENT_ARM = 0.0030
@@ -63,7 +63,7 @@ def grip_force(
         weight: the weight that the hand feels, in N.
         present: the present force of each pad, in N.
         parameters: the forces and loads.
-        moment: about the axis of the pads while the hand rests, in N m.
+        moment: the moment about the axis of the pads while the hand rests, in N m.
     """
     heavy, heaviest = parameters.heavy_load, max(parameters.heaviest_load, parameters.heavy_load)
     firm = max(parameters.firm_grasp_force, parameters.grasp_force)
@@ -87,11 +87,11 @@ def soft_force(
     Pads that go through a thin wall would neither hold it well nor let it go again.
 
     Args:
-        force: of `grip_force`, in N.
+        force: the result of `grip_force`, in N.
         sunk: how far the jaws have closed since they gripped, in m.
-        width: of the object when they gripped, in m.
+        width: the width of the object when the jaws gripped it, in m.
         present: the present force, in N.
-        parameters: the least and the largest force.
+        parameters: parameters with the least and the largest force.
     """
     peak = max(parameters.peak_grasp_force, parameters.grasp_force)
     soft = min(_SOFT, _SOFT_SHARE * width)
@@ -111,10 +111,10 @@ def gentleness(
     may turn between the pads. It never rises while the object is held.
 
     Args:
-        weight: what the hand feels, in N.
-        moment: about the axis of the pads while the hand rests, in N m.
+        weight: the weight that the hand feels, in N.
+        moment: the moment about the axis of the pads while the hand rests, in N m.
         present: the present share; 0 counts as 1.
-        parameters: the load.
+        parameters: parameters with the load above which the hand is gentle.
     """
     present = present or 1.0
     share = max(parameters.heavy_load / max(weight, parameters.heavy_load), _GENTLEST)
@@ -154,7 +154,7 @@ def may_turn(moment: float) -> bool:
     """Whether a poor grip may let an object turn between the pads.
 
     Args:
-        moment: about the axis of the pads while the hand rests, in N m.
+        moment: the moment about the axis of the pads while the hand rests, in N m.
     """
     return abs(moment) > _NOTABLE_MOMENT
 

@@ -32,7 +32,8 @@ turned."""
 _STUCK = 0.004
 """If the jaws have opened by this much less than commanded, they stick to the object, in m."""
 _PUSH = 1 / 3
-"""Then they open with this share of the grasp force, besides that of their springs."""
+"""Jaws that stick are opened with this share of the grasp force, in addition to the force by which
+they follow their command."""
 _LONGEST_RELEASE = 1.0
 """After this time the hand rises even if the jaws stick, in s."""
 _RISEN = 0.0005

@@ -108,7 +108,8 @@ class PlannerState(VectorView):
         """Stores the heights of an action in the state."""
         self.grasp_z, self.pick_top_z = motion.grasp, surfaces.pick_top
         self.table_z, self.support_z = surfaces.table, surfaces.support
-        # Lower an uncertain rim: an object that seems slightly below the rim may stand on it.
+        # The measured rim may be too high. Store the least height that it may have, so that an
+        # object that seems to be slightly below the rim still counts as standing on it.
         self.rim_z = surfaces.place_rim - surfaces.doubt
         self.floor_z, self.doubt = surfaces.place_floor, surfaces.doubt
         self.width = surfaces.width

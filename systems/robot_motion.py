@@ -71,12 +71,12 @@ class RobotMotion(Protocol):
         Args:
             state: the planner's state; modified.
             time: the present time.
-            share: of the acceleration limits.
+            share: the share of the acceleration limits that the motion may use.
         """
 
     def motion_at(self, state: PlannerState, time: float) -> NDArray[np.float64]:
-        """(size) desired positions, velocities and accelerations of the robot's joints at a
-        time."""
+        """(size) desired positions, velocities and accelerations of the robot's joints at a time,
+        in m, rad and s."""
 
     def hand_acceleration(
         self, state: PlannerState, time: float, desired: NDArray[np.float64]
@@ -95,7 +95,7 @@ class RobotMotion(Protocol):
         """Ramps the closing force from its present value to `force`, in N."""
 
     def opening_at(self, state: PlannerState, time: float) -> tuple[float, float]:
-        """The opening between the pads at a time, and its rate."""
+        """The opening between the pads at a time, in m, and its rate, in m/s."""
 
     def force_at(self, state: PlannerState, time: float) -> float:
         """The closing force at a time, in N."""

@@ -114,10 +114,10 @@ class SensorNoise(LeafSystem):
       pixels at constant variance, and is rounded to multiples of `depth_step (z / 1 m)^2`.
     - Beside an edge (a step of more than 15 mm between neighbours), a share `flying_share` of the
       pixels gets a depth between the two sides.
-    - Holes get depth 0, which Drake's cameras return for objects that are too close. Holes are
-      blobs over `hole_share` of the image; blobs over p percent of surfaces labelled SHEEN_LABELS +
-      p, if `label_image` is connected; and pixels that see a surface at more than `steepest_deg`
-      from its normal, which includes outlines.
+    - Holes get depth 0, which Drake's cameras return for objects that are too close. Blobs of holes
+      cover the share `hole_share` of the image. If `label_image` is connected, they cover p percent
+      of each surface with the label SHEEN_LABELS + p. Pixels that see a surface at more than
+      `steepest_deg` from its normal, such as those at outlines, are holes as well.
     - The output depth is the median of `frames` such images with independent noise.
     - Each colour channel is multiplied by a normally distributed gain of mean one.
     - `body_pose_in_world` is the *calibrated* pose, `X_Rig X_WB X_Camera`. Its errors have the

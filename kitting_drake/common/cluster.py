@@ -61,7 +61,8 @@ class RayWorkers:
         """Connects to the cluster.
 
         Raises:
-            UserError: Ray is not installed, there is no such cluster, or it rejects the files.
+            UserError: Ray is not installed, there is no such cluster, or it rejects the runtime
+                environment.
         """
         # Ray reports a dead node in one message. This setting keeps it from also printing the
         # node's log.

@@ -80,8 +80,7 @@ def _goal_problems(
 
 
 def _first_problem(stops: Iterable[HandStop], motion: ArmMotion) -> str:
-    """Says why the first stop cannot be reached; empty if any of the stops can be reached, or if
-    there are none."""
+    """Says why an arm cannot reach the first stop, if it can reach none of them; else empty."""
     first = ""
     for stop in stops:
         problem = reach_problem(motion.postures, [stop])

@@ -84,5 +84,8 @@ def _block(design: Design) -> NDArray[np.float64]:
 
 
 def _path(loop: NDArray[np.float64], width: float) -> str:
-    """Returns a closed SVG path (n, 2); y is flipped, because it points down in SVG."""
+    """Returns the SVG path of a closed loop (n, 2) on a block of the given width, both in mm.
+
+    The y axis is flipped, because it points down in SVG.
+    """
     return svg_path(np.column_stack([loop[:, 0], width - loop[:, 1]]))

@@ -72,7 +72,7 @@ class KitFiles:
 
     design: Design
     block: Manifold
-    """In the frame of the files, in mm."""
+    """The block in the frame of the files, in mm."""
     split: Split | None
     """The pieces; None: the block is whole."""
     sheet: FoamSheet | None

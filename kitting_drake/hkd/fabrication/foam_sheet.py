@@ -36,7 +36,7 @@ class SheetKit:
     size: tuple[float, float]
     """Length and width of its block, in mm."""
     height: float
-    """Of its block, in mm."""
+    """The height of the kit's block, in mm."""
     layers: dict[str, list[NDArray[np.float64]]]
     """Closed loops (n, 2) in mm by layer; the origin is the block's lower left corner."""
 
@@ -46,12 +46,12 @@ class KitPlace:
     """A kit on a sheet."""
 
     kit: int
-    """Its index."""
+    """The index of the kit in `FoamSheet.kits`."""
     x: float
+    """`x` and `y` are the position of the block's lower left corner, in mm."""
     y: float
-    """The lower left corner of its block, in mm."""
     turned: bool
-    """By 90 degrees, counter-clockwise."""
+    """Whether the kit is turned by 90 degrees, counter-clockwise."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class FoamSheet:
     kits: tuple[SheetKit, ...]
     places: tuple[KitPlace, ...]
     notes: tuple[str, ...]
-    """What found no room, in sentences."""
+    """A sentence for each kit that found no room, and for other things that a user should know."""
 
 
 def kit_of_dxf(name: str, text: str, height: float) -> SheetKit:
@@ -152,7 +152,8 @@ def fill_sheet(
 
 
 def _merit(places: Sequence[KitPlace], kits: Sequence[SheetKit]) -> tuple[int, float]:
-    """Prefers that no kit is missing, then the larger covered area."""
+    """Rates a packing: first by the number of different kits on the sheet, then by the area that
+    their blocks cover."""
     present = len({place.kit for place in places})
     return present, sum(math.prod(kits[place.kit].size) for place in places)
 
@@ -160,7 +161,7 @@ def _merit(places: Sequence[KitPlace], kits: Sequence[SheetKit]) -> tuple[int, f
 def _packings(
     room: tuple[float, float], gap: float, kits: Sequence[SheetKit], copies: int | None
 ) -> Iterator[list[KitPlace]]:
-    """Packings to choose from."""
+    """Yields the packings from which the best one is chosen."""
     areas = [math.prod(kit.size) for kit in kits]
     largest_first = sorted(range(len(kits)), key=lambda i: -areas[i])
     most = MOST_KITS if copies is None else copies * len(kits)
@@ -187,7 +188,10 @@ def _packed(
     turned: Sequence[bool] | None,
     by_rows: bool,
 ) -> list[KitPlace]:
-    """Places each kit in order as low (or as far left) as possible; leaves out what has no room."""
+    """Places the kits in order, each as low as possible (by rows) or as far left as possible.
+
+    A kit for which there is no room is left out.
+    """
     places: list[KitPlace] = []
     boxes = np.empty((0, 4))
     hopeless: set[tuple[int, bool | None]] = set()

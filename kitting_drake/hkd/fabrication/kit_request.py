@@ -18,9 +18,9 @@ FITS = {"snug": 0.15, "easy": 0.35, "loose": 0.75}
 """Named clearances between a tool and the wall, on each side, in mm."""
 
 _WIDEST_MM = 10.0
-"""The largest clearance."""
+"""The largest clearance, in mm."""
 _LONGEST_MM = 1000.0
-"""The longest side of a block of given size."""
+"""The longest side of a block of given size, in mm."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class SheetRequest:
     copies: int | None = None
     """How many of each kit. None: as many as find room."""
     others: tuple[Path, ...] = ()
-    """Folders of other kits to put on it."""
+    """Folders of other kits that are placed on the same sheet."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class KitRequest:
     lead_in_mm: float | None = None
     """The width of the bevel around the rims. None: the template's 1 mm."""
     fit_of: tuple[tuple[str, float], ...] = ()
-    """Names or paths of tools with clearances of their own."""
+    """Pairs of a tool's name or path and its own clearance, in mm, instead of `clearance_mm`."""
     stand_out_mm: float = 0.0
     """By how much the tops of the tools stand out of the block."""
     wall_mm: float | None = None
@@ -65,11 +65,12 @@ class KitRequest:
     gridfinity: bool = False
     """Whether the block gets sides and feet for Gridfinity's grid."""
     nozzle_mm: float = 0.4
-    """Thinner walls are reported."""
+    """The width of the printer's nozzle. Walls that are thinner are reported."""
     bed_mm: tuple[float, float] | None = None
-    """A larger block is split into pieces that fit this bed. None: not split."""
+    """The sides of the printer's bed. A larger block is split into pieces that fit it. None: the
+    block is not split."""
     joint_play_mm: float = 0.1
-    """Between a dovetail and its socket, on each side."""
+    """The gap between a dovetail and its socket, on each side."""
     sheet: SheetRequest | None = None
     robot: str = ""
     """YAML lines that set the robot in the kit's scenario; empty: the default robot."""

@@ -117,9 +117,9 @@ def _ring(size: tuple[float, float], radius: float, inset: float, z: float) -> N
 
     Args:
         size: the sides of the rectangle without the inset, in mm; its corner is at the origin.
-        radius: of its corners, after the inset.
-        inset: the distance of the rectangle from the given sides.
-        z: the height.
+        radius: the radius of the inset rectangle's corners, in mm.
+        inset: the distance of the rectangle from the given sides, in mm.
+        z: the height, in mm.
     """
     sides = np.array(size) - 2 * inset
     if radius:

@@ -80,7 +80,11 @@ def undercut_notes(solid: Manifold, design: Design) -> list[str]:
 def _vanished(
     design: Design, recesses: Sequence[Recess], room: CrossSection
 ) -> Iterator[tuple[str, str]]:
-    """Walls that are not there at all: what they should divide, and a sentence."""
+    """Finds missing walls, where a cavity overlaps another one or the block's side.
+
+    Yields:
+        A text that names the two things that the wall should divide, and a sentence for the user.
+    """
     cavities = [recess for recess in recesses if recess.kind == "cavity"]
     for one, other in itertools.combinations(cavities, 2):
         common = one.outline ^ other.outline

@@ -1,6 +1,6 @@
 """Generates hammers: a forged head on a handle. They lie on their side with the face toward +y."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -65,11 +65,12 @@ class HammerParameters:
     cheek_roundness: float = 0.3
 
 
-def _typed(kind: type, value: Any, field: str) -> Any:
+def _typed(kind: type[HeadEnd | Shaft], value: Any, field: str) -> Any:
     try:
         return kind(**value) if isinstance(value, dict) else value
     except TypeError as error:
-        raise UserError(f"hammer: {field}: {error}") from error
+        known = ", ".join(f.name for f in fields(kind))
+        raise UserError(f"hammer: {field} may only have the fields {known}") from error
 
 
 def build_hammer(p: HammerParameters) -> list[Part]:

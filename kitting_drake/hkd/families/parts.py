@@ -94,8 +94,8 @@ def ring(outer: float, inner: float, height: float) -> PartDesign:
         )
     if small <= _PAD or (big + small) / 2 - _INNER_REACH < -math.sqrt(small**2 - 110.0):
         raise PartError(
-            f"a ring of more than {WIDEST_MM:g} mm is held across its rim, and a bore of {inner:g} "
-            "mm leaves the finger no room"
+            f"a bore of {inner:g} mm has no room for the finger that grips the rim of a ring of "
+            f"more than {WIDEST_MM:g} mm: give a wider bore, or a smaller ring"
         )
     # The two ends of the inner pad touch the bore.
     chord = math.sqrt(small**2 - (_PAD / 2) ** 2)

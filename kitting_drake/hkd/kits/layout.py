@@ -73,7 +73,8 @@ def slot_pose(tool: Tool, parameters: KitParameters) -> CavityPose:
 
 
 def _floor(tool: Tool, parameters: KitParameters) -> float:
-    """The height of a tool's floor in the kit frame: its top is flush, or stands out."""
+    """The height, in the kit frame and in metres, of the floor of a tool's cavity. On this floor,
+    the tool's top is `stand_out` above the block's top."""
     return parameters.height - tool.height + parameters.stand_out
 
 
@@ -119,7 +120,8 @@ def layout_kit(tools: Sequence[Tool], parameters: KitParameters) -> KitLayout:
 
 
 def _check_height(tool: Tool, parameters: KitParameters) -> None:
-    """Raises UserError if a tool is too high for the block, or hardly in it."""
+    """Raises UserError if a tool is too high for the block, or stands out of its cavity so far that
+    it is not held."""
     if _floor(tool, parameters) < parameters.minimum_wall - 1e-9:
         raise UserError(
             f"'{tool.name}' is {1e3 * tool.height:.1f} mm high: in a block of "

@@ -132,8 +132,11 @@ def _grown(profile: CrossSection, distance: float) -> CrossSection:
 
 
 def _fits(hull: _Hull, allowed: CrossSection, tolerance: float) -> bool:
-    """Whether a merged hull stays in `allowed` on xy, and keeps the other projections of its
-    sources."""
+    """Whether a hull may be merged from its sources.
+
+    Its xy projection must stay within `allowed`. Its other two projections may be larger than those
+    of its sources by at most `tolerance` (mm).
+    """
     if (projection([hull.points]) - allowed).area() > _AREA:
         return False
     return all(

@@ -22,8 +22,9 @@ _HEIGHT_MM = 0.2
 """The tolerance in mm for thinning a hull's vertices; the outline has a finer one."""
 _AREA = 2e-3
 """Area (mm^2) below which two outlines count as equal."""
-# A piece is cut at a height if the cut makes its hull smaller by more than this share and this
-# volume (mm^3). Then the number of heights to try, and the largest number of cuts.
+# A piece is cut at a height if the cut makes its hull smaller by more than the share `_SHARE` and
+# by more than `_VOLUME` (mm^3). `_LEVELS` is the number of heights to try, `_MOST_CUTS` the largest
+# number of cuts.
 _SHARE, _VOLUME, _LEVELS, _MOST_CUTS = 0.08, 8.0, 9, 2
 _TIP = 1.0
 """The distance in mm within which a cell can be extended to a tip of the outline."""
@@ -112,8 +113,8 @@ def convex_cells(inner: CrossSection, outer: CrossSection) -> list[CrossSection]
     """Covers the region `inner` with few convex polygons that stay within `outer` and may overlap.
 
     The largest uncovered triangle of `inner` grows by neighbouring triangles as long as their hull
-    is within `outer`. The cell is the hull of those of them that were uncovered. This repeats until
-    all triangles are covered.
+    is within `outer`. Some of these triangles may be covered by earlier cells; the hull of the
+    others is the new cell. This repeats until all triangles are covered.
     """
     loops = inner.to_polygons()
     corners = np.vstack(loops)

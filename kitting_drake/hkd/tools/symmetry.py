@@ -30,8 +30,7 @@ ORDERS = (24, 12, 10, 9, 8, 7, 6, 5, 4, 3, 2)
 _SAMPLES, _DENSE_SAMPLES = 4000, 400_000
 
 _FAR_MM, _COARSER = 2.0, 20
-"""First a distance in mm, then a stride: distances above the first are measured to a subset of the
-samples only, one in every `_COARSER`.
+"""A distance above `_FAR_MM` is measured only to every `_COARSER`th sample, and so is less exact.
 
 This saves time, because the search for the nearest neighbour is slow for a point on the axis of a
 hollow part: it is equally far from the whole wall.

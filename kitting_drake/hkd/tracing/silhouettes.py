@@ -47,9 +47,9 @@ def find_silhouettes(
     Args:
         cv2: OpenCV.
         photo: the plane as seen from straight above.
-        sheet: (2,) the size of the sheet, whose lower left corner is the origin. The tools lie on
-            it. None: the whole photo is ground.
-        hidden: polygons to leave out.
+        sheet: (2,) the sides of the sheet on which the tools lie, in mm; its lower left corner is
+            the origin. None: there is no sheet, and tools may lie anywhere in the photo.
+        hidden: polygons (n, 2) in mm in which no tools are searched.
         height: the height of the lowest tool, in mm; None: unknown.
 
     Returns:

@@ -221,7 +221,16 @@ def _roughness(cv2: Any, light: Array, even: Array, px_per_mm: float) -> Array:
 
 
 def _reached(cv2: Any, even: Array, plain: Array, px_per_mm: float) -> Array:
-    """Finds the pixels that a disc can cover as it rolls over `even` pixels from plain ground."""
+    """Finds the pixels that a rolling disc can cover.
+
+    The disc starts on plain ground, and all pixels below it must be even.
+
+    Args:
+        cv2: OpenCV.
+        even: (rows, columns) true where the picture is smooth, as on the ground or in a shadow.
+        plain: (rows, columns) true where lightness and colour are those of the ground.
+        px_per_mm: the resolution.
+    """
     disc = _disc(cv2, _BALL_MM * px_per_mm)
     room = cv2.erode(even.astype(np.uint8), disc)
     count, labels = cv2.connectedComponents(room, connectivity=4)

@@ -58,7 +58,7 @@ class ObservedScene:
 
     @property
     def targets(self) -> tuple[LabelledImage, ...]:
-        """A label for each action. All share one image, which is computed at each access."""
+        """A label for each action. Each access computes the image anew, once for all labels."""
         image = self.recorded.image
         return tuple(LabelledImage.from_action(image, action, self.grid) for action in self.actions)
 

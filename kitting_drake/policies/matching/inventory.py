@@ -134,8 +134,8 @@ class Inventory:
     def is_tried(self, region: Region | None) -> bool:
         """Whether an object should not be tried again. For None the result is False.
 
-        That holds after `_MOST_TRIES` attempts, and for an object that fits into no recess and was
-        already laid aside here.
+        An object is not tried again after `_MOST_TRIES` attempts. Neither is one that fits into no
+        recess, if it was already laid aside here.
         """
         if region is None:
             return False

@@ -208,8 +208,9 @@ def refine_grasp(
 ) -> RefinedGrasp | None:
     """Refines a predicted grasp.
 
-    Returns a feasible grasp of the same object within 4 cm of the predicted one. If the predicted
-    grasp is feasible and not much worse, returns it. None if there is no feasible grasp.
+    Returns the predicted grasp if it is feasible and its cost is not much higher than that of other
+    grasps. Otherwise returns another feasible grasp of the same object within 4 cm of the predicted
+    one, or None if there is none.
 
     Args:
         segmentation: the segmentation of o_t.
@@ -247,8 +248,8 @@ def refine_grasp(
     if failed is not None:
         near = untried(near, failed, resolution)
     least = min((grasp.cost for grasp in near), default=math.inf)
-    # The network considers more than the room for the jaws, so keep its grasp unless that is much
-    # worse.
+    # The network takes more into account than the cost does, so keep its grasp unless another one
+    # costs much less.
     same = min((g.cost for g in grasps if is_same(*away(g))), default=None)
     if same is not None and same < least + _MUCH_WORSE:
         return RefinedGrasp(pick, theta, same)

@@ -159,8 +159,9 @@ def register(
         recess: the outline of the recess.
         starts: initial rotations in radians and shifts in pixels. If there are none, the best of
             many rotations about the centroids are refined.
-        within: whether the second outline is that of several touching objects. Parts of the first
-            outline then have no counterpart and get little weight, and the offset is nearly zero.
+        within: whether `recess` is in fact the outline of several touching objects, and `outline`
+            that of one of them. Parts of `outline` then have no counterpart and get little weight,
+            and the offset is nearly zero.
     """
     begins = starts or _coarse_starts(outline, recess)
     found = [_refine(outline, recess, rotation, shift, within) for rotation, shift in begins]

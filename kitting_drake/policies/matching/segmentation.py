@@ -61,7 +61,7 @@ _CLEARLY = 2.0
 """A height that differs by more standard deviations than this is not noise.
 
 The few noisy pixels that exceed it are isolated. A larger value would cut off the flat ends of an
-object, which distinguish it from itself after half a turn.
+object. These ends show which of two headings, half a turn apart, the object has.
 """
 _OBJECT_SEEN, _RECESS_SEEN = 0.5, 0.3
 """The least shares of an object's pixels, and of a free recess's pixels, that must be seen."""
@@ -69,8 +69,8 @@ _GAP, _LEAST_GAP = 1.5, 0.003
 """Half the width of the gap between an object and its recess is less than this: the first number in
 pixels, or the second in metres if that is more."""
 _FLAT, _FLAT_SHARE = 0.0006, 0.7
-"""The floor of a free recess is flat: more than the second number, as a share, is within the first
-number, in metres, of one height. If the noise is larger, its range counts instead."""
+"""A recess is free if its floor is flat: more than the share `_FLAT_SHARE` of the floor is within
+`_FLAT`, in metres, of one height. If twice the noise is more than `_FLAT`, it is used instead."""
 _NOISY = 0.001
 """If the noise has a larger standard deviation than this, a floor cannot be distinguished from an
 object, in metres."""

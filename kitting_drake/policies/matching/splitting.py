@@ -45,8 +45,9 @@ _SHARED, _COST = 0.45, 0.0010
 """The least share of an outline's points that must be shared, and the largest mean distance of
 these points from the region's outline, in metres."""
 _CLEARLY, _UNEXPLAINED = 0.65, 0.15
-"""If more than the second number, as a share of a region's area, is not explained by objects of
-free recesses, each outline found in it must share at least the first number of its points."""
+"""The objects found in a region may leave a part of it unexplained. If this part is more than the
+share `_UNEXPLAINED` of the region's area, each object must share at least `_CLEARLY` of its
+outline's points with the region's outline."""
 _LEAST_PART = 0.35
 """A region whose area is less than this share of a recess's contains no object of that recess."""
 _HIGHER, _ACROSS = 0.006, 6

@@ -144,9 +144,9 @@ class Calibration:
         return self.outline.inside(self.grid)
 
     def contains(self, xy: Array) -> NDArray[np.bool_]:
-        """Whether points (..., 2) in the base frame are in the workspace and over the table (...).
+        """Returns a mask (...) of the points (..., 2) that are in the workspace and over the table.
 
-        Heights are ignored.
+        The points are (x, y) in the base frame, in metres.
         """
         inside = self.grid.contains(xy)
         if self.region is None:
@@ -273,7 +273,8 @@ def _read_lens_of_file(path: Path, name: str, node: dict[str, Any], where: str) 
     check_distortion(lens, f"{where}: {file}")
     intrinsics = read_intrinsics(lens, f"{where}: {file}")
     if size not in (None, intrinsics.size):
-        raise UserError(f"{where}: resolution is not that of {file}, {intrinsics.size}")
+        wide, high = intrinsics.size
+        raise UserError(f"{where}: resolution must be that of {file}, which is {wide}x{high}")
     return intrinsics
 
 

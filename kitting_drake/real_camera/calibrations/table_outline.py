@@ -91,7 +91,7 @@ class TableOutline:
 
 
 def inside_polygon(xy: NDArray[np.float64], polygon: Sequence[Sequence[float]]) -> NDArray[Any]:
-    """Whether points (..., 2) lie inside a polygon, by the even-odd rule (...)."""
+    """Returns a mask (...) of the points (..., 2) inside a polygon, by the even-odd rule."""
     x, y = xy[..., 0], xy[..., 1]
     inside = np.zeros(x.shape, bool)
     for (x0, y0), (x1, y1) in zip(polygon, [*polygon[1:], polygon[0]], strict=True):

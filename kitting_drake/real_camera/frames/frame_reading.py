@@ -147,7 +147,10 @@ def _frame(
 
 
 def _grouped(files: Sequence[Path]) -> Iterator[_Sources]:
-    """Yields the files of each camera: single files that hold both, or pairs in either order."""
+    """Yields the files of each camera: one that holds colour and depth, or (colour, depth).
+
+    The two files of such a pair may be given in either order.
+    """
     for path in files:
         _check_ending(path)
     if files and all(path.suffix.lower() in _WHOLE_ENDINGS for path in files):

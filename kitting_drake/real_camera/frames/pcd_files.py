@@ -23,8 +23,8 @@ def read_pcd(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8] | None,
     """Reads a point cloud.
 
     Returns:
-        The points (n, 3), their colours (n, 3) or None, and the (width, height) in which they are
-        organised.
+        The points (n, 3) in the unit of the file; their colours (n, 3), or None; and the
+        (width, height) of the grid in which the points are organised.
 
     Raises:
         UserError: the file is damaged, or its points are not in the camera's frame.
@@ -71,7 +71,10 @@ def _read_header(content: bytes) -> tuple[dict[str, list[str]], int]:
 
 
 def _read_table(header: dict[str, list[str]], data: bytes) -> dict[str, NDArray[Any]]:
-    """Returns the first number of each field, by the field's name."""
+    """Returns each field's values (n,) for the n points, by the field's name.
+
+    If a field has several numbers for each point, only the first one is returned.
+    """
     names = header["FIELDS"]
     counts = [int(word) for word in header.get("COUNT", ["1"] * len(names))]
     kinds = [

@@ -42,7 +42,7 @@ def read_cloud(
         points, colors, organised = read_pcd(path)
         if organised[1] > 1 and organised != (width, height):
             raise UserError(
-                f"{path} is {organised[0]}x{organised[1]} points, but camera {camera.name} was "
+                f"{path} has {organised[0]}x{organised[1]} points, but camera {camera.name} was "
                 f"calibrated at {width}x{height}"
             )
     else:

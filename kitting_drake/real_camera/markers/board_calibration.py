@@ -117,8 +117,8 @@ def _calibrate_camera(board: Board, paths: Sequence[Path], camera: BenchCamera) 
         alone = max(item.rms for item in singles)
         if fit.rms > alone + _MOVED:
             raise UserError(
-                f"{where}: its images err by {fit.rms:.2f} pixels together, and by at most "
-                f"{alone:.2f} pixels each alone: did the board or the camera move between them?"
+                f"{where}: one pose errs by {fit.rms:.2f} pixels over all images, but a pose for "
+                f"each image by at most {alone:.2f}: did the board or the camera move between them?"
             )
     corners = sum(len(item.points) for item in seen)
     return CalibratedCamera(camera.name, images[0], seen[0], len(paths), corners, fit)

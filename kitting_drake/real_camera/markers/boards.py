@@ -254,7 +254,8 @@ def _length(content: dict[str, Any], key: str, path: Path) -> float:
 
 
 def _pose(content: dict[str, Any], size: tuple[float, float], path: Path) -> Array:
-    """Returns the pose (4, 4) of the board in the base, as given or from touched corners."""
+    """Returns the pose (4, 4) of the board in the base: the given one, or that of three corners
+    that were touched with the robot."""
     if ("pose" in content) == ("touch" in content):
         raise UserError(
             f"{path} must have either pose (of the board in the base frame), or touch with the "

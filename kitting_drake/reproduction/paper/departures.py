@@ -126,7 +126,8 @@ def _earlier_hand(results: Mapping[str, Result]) -> str:
     found = [has_unlimited_hand(item.summary["resolved_scenario"]) for item in results.values()]
     if not any(found):
         return ""
-    return f"\n{prose('unlimited_hand', older=sum(found), all=len(found))}"
+    some = "all" if all(found) else f"{sum(found)} of the"
+    return f"\n{prose('unlimited_hand', cells=f'{some} {len(found)} cells')}"
 
 
 def _memory(results: Mapping[str, Result]) -> str:

@@ -172,7 +172,10 @@ class _Cutter:
         return price
 
     def cuts(self, counts: tuple[int, int]) -> Cuts | None:
-        """Cuts into so many pieces along x and y, or None if a wall is thin whatever is tried."""
+        """Divides the block into the given numbers of pieces along x and y.
+
+        Returns None if all cuts that were tried leave a thin wall.
+        """
         price = self._price.copy()
         for _ in range(_REPAIRS):
             lines, regions, cost = self._divide(counts, price)
@@ -223,7 +226,7 @@ class _Cutter:
         return (line if axis == 0 else line[:, ::-1]), cost
 
     def _thin(self, regions: Sequence[CrossSection]) -> list[CrossSection]:
-        """The walls and sharp tips that the cuts leave and the whole block has not."""
+        """The thin walls and sharp tips that the cuts make, without those of the whole block."""
         for solid, known in self._levels:
             found = []
             for region in regions:
@@ -254,7 +257,11 @@ def _levels(
 
 
 def _cheapest_path(price: NDArray[np.float64]) -> tuple[NDArray[np.int64], float]:
-    """The column of a path in each row of costs per mm, and the path's cost."""
+    """Finds the cheapest path through a raster (rows, columns) of costs per mm, row by row.
+
+    Returns:
+        The path's column in each row, and the path's cost.
+    """
     rows, columns = price.shape
     shifts = np.arange(-_STEEPEST, _STEEPEST + 1)
     lengths = np.hypot(1.0, shifts) * _CELL

@@ -43,9 +43,9 @@ class Joint:
     owner: int
     other: int
     outline: CrossSection
-    """The dovetail, with an overlap with its own piece."""
+    """The outline of the dovetail, in mm. It overlaps its own piece."""
     height: float
-    """In mm above the block's bottom."""
+    """The height of the dovetail's top above the block's bottom, in mm."""
 
 
 _Box = tuple[float, float, float, float]
@@ -130,7 +130,7 @@ def _spread(
 def _keeps_walls(
     joint: Joint, regions: Sequence[CrossSection], feet: Sequence[CrossSection]
 ) -> bool:
-    """Whether a joint leaves no thin wall beside a bend of the cut or the side of a foot."""
+    """Whether all walls between a joint and a bend of the cut or a foot's side are thick enough."""
     near = joint.outline.offset(4 * _MARGIN, JoinType.Miter)
     owner, other = (regions[i] ^ near for i in (joint.owner, joint.other))
     inner = joint.outline.offset(2 * _MARGIN, JoinType.Miter)

@@ -12,7 +12,7 @@ LEAST_WALL = 1.2
 """The least thickness of a wall, in mm: three lines of a nozzle of 0.4 mm."""
 
 _SHARPEST = math.radians(42)
-"""Sharper corners count as thin walls."""
+"""The angle in radians below which a corner counts as a thin wall."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,10 @@ def united(outlines: Iterable[CrossSection]) -> CrossSection:
 
 
 def corner_area(least: float) -> float:
-    """The area that `thin_parts` finds at the tip of the sharpest corner that is no thin wall."""
+    """The area that `thin_parts` finds at the tip of a corner with the angle `_SHARPEST`.
+
+    A part with at most this area is therefore the tip of a corner, not a thin wall.
+    """
     return (least / 2) ** 2 * (1 / math.tan(_SHARPEST / 2) - (math.pi - _SHARPEST) / 2)
 
 

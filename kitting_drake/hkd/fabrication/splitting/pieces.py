@@ -16,7 +16,8 @@ _BEYOND = 1.0
 """The distance by which cutters stick out of the block, in mm."""
 _MOST_PIECES = 40
 _UPRIGHT = 2
-"""How many of the sections of the feet are below their upper slope."""
+"""The number of sections of the feet, from the lowest one on, that lie below the feet's upper
+slope."""
 
 
 @dataclass(frozen=True)
@@ -24,10 +25,10 @@ class Piece:
     """A piece of a block, in the block's frame, in mm."""
 
     number: int
-    """From 1. A piece is lowered onto those with lower numbers."""
+    """The number of the piece, counted from 1. A piece is lowered onto those with lower numbers."""
     body: Manifold
     region: CrossSection
-    """From above, without the joints."""
+    """The outline of the piece from above, without its joints."""
 
     @property
     def corner(self) -> NDArray[np.float64]:
@@ -36,7 +37,7 @@ class Piece:
 
     @property
     def size(self) -> NDArray[np.float64]:
-        """The extents (3)."""
+        """The extents (3) of the piece along x, y and z."""
         return np.array(self.body.bounding_box()[3:]) - self.corner
 
 
@@ -47,7 +48,7 @@ class Split:
     pieces: tuple[Piece, ...]
     joints: tuple[Joint, ...]
     play: float
-    """Between a dovetail and its socket, on each side, in mm."""
+    """The gap between a dovetail and its socket, on each side, in mm."""
     notes: tuple[str, ...]
 
 
@@ -82,7 +83,7 @@ def split_block(
     notes = []
     cuts = choose_cuts((length, width), openings, bed, feet)
     if cuts is None and feet:
-        # Only the upright parts of the feet then have no thin walls.
+        # Allow thin walls on the upper slopes of the feet, but not below them.
         cuts = choose_cuts((length, width), openings, bed, feet[:_UPRIGHT])
         notes.append("cuts beside feet leave thin edges on the slopes of the feet: trim them")
     if cuts is None:

@@ -127,12 +127,12 @@ def _scale(root: ElementTree.Element, text: bytes, unit_mm: float | None) -> tup
     if given:
         return 25.4 / 96, "by pixels of 1/96 inch, because it states no unit"
     readings = ", ".join(
-        f"{mm * sides[1]:.0f} mm in {name}"
-        for name, mm in (("mm", 1.0), ("units of 1/72 inch", 25.4 / 72), ("1/96 inch", 25.4 / 96))
+        f"{mm * sides[1]:.0f} mm if a unit is {name}"
+        for name, mm in (("1 mm", 1.0), ("1/72 inch", 25.4 / 72), ("1/96 inch", 25.4 / 96))
     )
-    size = f": its page, {sides[1]:g} units long, would be {readings}" if sides[1] else ""
+    size = f" (its page is {sides[1]:g} units long: {readings})" if sides[1] else ""
     raise UserError(
-        f"the drawing has no size in width and height{size}: set them, or give --unit or "
+        f"the drawing does not state its width and height{size}: set them, or give --unit or "
         "--length_mm"
     )
 

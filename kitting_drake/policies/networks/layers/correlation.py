@@ -213,8 +213,12 @@ def kernel_window(
 
 
 def _overlap(start: int, length: int, side: int) -> tuple[slice, tuple[int, int]]:
-    """The slice of an axis of `side` pixels that lies within a span, and the padding before and
-    after it that fills the span."""
+    """Cuts a span of `length` pixels, from the pixel `start` on, out of an axis of `side` pixels.
+
+    Returns:
+        The slice of the axis, and the numbers of pixels to pad before and after it, because the
+            span may extend beyond the axis.
+    """
     first = min(max(start, 0), side)
     last = min(max(start + length, first), side)
     before = min(max(-start, 0), length)
