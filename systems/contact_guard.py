@@ -30,11 +30,15 @@ _AT_REST = (Mode.OBSERVE, Mode.DONE)
 
 
 def known_payload(state: PlannerState) -> float:
-    """The vertical force of the payload on the hand, in N, negative downwards. It is zero until the
-    payload has been weighed, and after it is placed."""
+    """The vertical force of the held object on the hand, in N, negative downwards: as it is felt,
+    and as soon as it has been weighed, its weight. It is zero in other modes than `LIFT`, `CARRY`,
+    `LOWER` and `SEARCH`."""
     mode = Mode(int(state.mode))
-    weighed = mode == Mode.CARRY and state.weighings >= _WEIGHINGS / 2
-    return state.payload if weighed or mode in (Mode.LOWER, Mode.SEARCH) else 0.0
+    if mode in (Mode.LOWER, Mode.SEARCH):
+        return state.payload
+    if mode not in _UNWEIGHED:
+        return 0.0
+    return state.payload if state.weighings >= _WEIGHINGS / 2 else state.felt_payload
 
 
 class ContactGuard:
@@ -74,7 +78,7 @@ class ContactGuard:
 
     def reset(self, state: PlannerState) -> None:
         """Clears the peaks and the payload of the last action."""
-        state.payload = state.weighings = state.beyond = 0.0
+        state.payload = state.felt_payload = state.weighings = state.beyond = 0.0
         state.peak_vertical = state.peak_lateral = 0.0
         state.recent = np.zeros(3 * RECENT)
         state.peak_mode = state.mode
@@ -106,6 +110,8 @@ class ContactGuard:
         if mode == Mode.CARRY:
             self._weigh(state, -f_z / pull, height)
         mass = self._mass(state, mode, -f_z / pull)
+        if mode in _UNWEIGHED and not state.weighings:
+            state.felt_payload = -GRAVITY * mass
         vertical = f_z + mass * pull
         if mode in _LETS_GO:
             vertical = f_z - min(max(f_z, -mass * pull), 0.0)

@@ -45,8 +45,8 @@ class JointController(LeafSystem):
     - `desired_motion` (21): positions q_d, velocities v_d and accelerations a_d of the joints, in
       rad and s.
     - `desired_opening` (2), `closing_force` (1): as in `TrajectoryController`.
-    - `payload` (1): the vertical force of the held object on the hand, as the planner has weighed
-      it, in N; it is negative, and zero for an empty hand.
+    - `payload` (1): the vertical force of the held object on the hand, as the planner knows it, in
+      N; it is negative, and zero for an empty hand.
     - `desired_state` (14): positions q_n and velocities v_n, for the plant's port `desired_state`.
     - `feedforward` (7): u_ff, for the plant's actuation port, in N m.
     - `finger_force` (2): actuation of the fingers, in N.

@@ -86,8 +86,8 @@ class PickPlacePlanner(LeafSystem):
     - `peak_force` (3): the largest vertical and lateral contact force on the hand in the present or
       last action, without the weight of the held object, in N, as means over 1/64 s; then the
       `Mode` in which the larger of the two occurred. See `ContactGuard`.
-    - `payload` (1): the weight of the object that the hand carries or lowers, as a vertical force
-      in N. It is negative, or zero if the object has not been weighed.
+    - `payload` (1): the vertical force of the object that the hand lifts, carries or lowers, in N:
+      as it is felt, and as soon as it has been weighed, its weight. It is negative or zero.
     - `asks` (1): 1 if the planner's next update, at the context's time, will evaluate `action`;
       else 0.
     - `accepted_action` (abstract, `PickPlaceAction`): the action that began last, with the hand's

@@ -62,6 +62,8 @@ class PlannerState(VectorView):
     search_step = Number()
     payload = Number()
     """The vertical force of the payload on the hand, in N; negative or zero."""
+    felt_payload = Number()
+    """The last such force that was felt before the payload was weighed."""
     weighings = Number()
     """Number of samples in the mean that gives `payload`."""
     beyond = Number()

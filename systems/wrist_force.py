@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame, JacobianWrtVariable
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
@@ -26,6 +27,7 @@ class WristForce(LeafSystem):
         - finger_contact_force
         output_ports:
         - wrist_force
+        - wrist_moment
 
     - `robot_state` (18): positions of the seven joints and both fingers, then their velocities.
     - `joint_contact_torque` (7): tau, the torques that contacts cause in the joints, in N m. A
@@ -34,6 +36,8 @@ class WristForce(LeafSystem):
     - `wrist_force` (6): contact forces along x, y, z (N), the moment about z (N m), and the force
       on each finger (N), at the gripper frame G and in the world's axes. It is the input
       `hand_contact_force` of the `PickPlacePlanner`.
+    - `wrist_moment` (1): their moment at G about G's y axis, along which the jaws close, in N m. It
+      is the planner's input of that name.
 
     The spatial force F on the hand at G solves, in the sense of least squares,
 
@@ -77,21 +81,30 @@ class WristForce(LeafSystem):
         if noise > 0:
             tickets.add(self.time_ticket())
         self.DeclareVectorOutputPort("wrist_force", 4 + FINGERS, self._calc_force, tickets)
+        self.DeclareVectorOutputPort("wrist_moment", 1, self._calc_moment, tickets)
 
     def _calc_force(self, context: Context, output: BasicVector) -> None:
+        _, _, about_z, x, y, z = self._spatial_force(context).tolist()
+        fingers = self._finger_force.Eval(context).tolist()
+        output.SetFromVector([x, y, z, about_z, *fingers])
+
+    def _calc_moment(self, context: Context, output: BasicVector) -> None:
+        moment = self._spatial_force(context)[:3]
+        # The spatial force has set the scratch context.
+        jaws = self._gripper.CalcPoseInWorld(self._scratch).rotation().col(1)
+        output.SetFromVector([moment @ jaws])
+
+    def _spatial_force(self, context: Context) -> NDArray[np.float64]:
+        """(6) F: moment, then force; sets the positions in the scratch context."""
         torque = self._torque.Eval(context)
         if self._noise > 0:
             # The time in microseconds identifies the step, and so seeds its noise.
             moment = round(1e6 * context.get_time())
             rng = np.random.default_rng([self._seed, _STREAM, moment])
             torque = torque + rng.normal(0.0, self._noise, JOINTS)
-        force = [0.0] * 4
-        if torque.any():
-            force = self._solve(self._robot_state.Eval(context), torque)
-        output.SetFromVector([*force, *self._finger_force.Eval(context).tolist()])
-
-    def _solve(self, state: np.ndarray, torque: np.ndarray) -> list[float]:
-        arm = self._arm
+        if not torque.any():
+            return np.zeros(6)
+        arm, state = self._arm, self._robot_state.Eval(context)
         q, v = state[: JOINTS + FINGERS], state[JOINTS + FINGERS :]
         arm.SetPositions(self._scratch, q - self._step * v)
         world = arm.world_frame()
@@ -99,5 +112,4 @@ class WristForce(LeafSystem):
             self._scratch, JacobianWrtVariable.kV, self._gripper, np.zeros(3), world, world
         )[:, :JOINTS]
         # Solve the normal equations; J has full rank while the hand points down.
-        _, _, about_z, x, y, z = np.linalg.solve(jacobian @ jacobian.T, jacobian @ torque).tolist()
-        return [x, y, z, about_z]
+        return np.linalg.solve(jacobian @ jacobian.T, jacobian @ torque)

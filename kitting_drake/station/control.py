@@ -45,8 +45,8 @@ class _Driven:
     hand_state: OutputPort
     wrist_force: OutputPort
     actuation: OutputPort
-    wrist_moment: OutputPort | None = None
-    """The moment about the hand's y axis, for the planner's port of that name; None for an arm."""
+    wrist_moment: OutputPort
+    """The moment about the hand's y axis, for the planner's port of that name."""
 
 
 def add_control(
@@ -93,8 +93,7 @@ def add_control(
         builder.Connect(projector.GetOutputPort("heights"), planner.GetInputPort("observation"))
     builder.Connect(driven.hand_state, planner.GetInputPort("hand_state"))
     builder.Connect(driven.wrist_force, planner.GetInputPort("hand_contact_force"))
-    if driven.wrist_moment is not None:
-        builder.Connect(driven.wrist_moment, planner.GetInputPort("wrist_moment"))
+    builder.Connect(driven.wrist_moment, planner.GetInputPort("wrist_moment"))
     for port in ("desired_motion", "desired_opening", "closing_force"):
         target = driven.controller.GetInputPort(port)
         if takes_joint_targets:
@@ -132,7 +131,7 @@ def _drive_hand(builder: DiagramBuilder, scenario: Scenario, plant: MultibodyPla
         state,
         force,
         controller.get_output_port(),
-        wrist_moment=moment.get_output_port(),
+        moment.get_output_port(),
     )
 
 
@@ -183,8 +182,9 @@ def drive_arm(
         controller,
         robot_state,
         hand_state.get_output_port(),
-        wrist.get_output_port(),
+        wrist.GetOutputPort("wrist_force"),
         actuation.get_output_port(),
+        wrist.GetOutputPort("wrist_moment"),
     )
 
 

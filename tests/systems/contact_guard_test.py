@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from systems.contact_guard import ContactGuard
+from systems.contact_guard import ContactGuard, known_payload
 from systems.pick_place_parameters import Mode
 from systems.planner_state import PlannerState
 
@@ -36,6 +36,23 @@ def test_weight_and_inertia_of_the_held_object_are_no_contact(mass: float):
         assert not hand.feel(force, a, times=20)
     assert hand.state.payload == pytest.approx(-mass * GRAVITY)
     assert max(hand.state.peak_vertical, hand.state.peak_lateral) < 1e-9
+
+
+def test_a_load_is_known_as_it_is_lifted_but_no_more_than_the_hand_can_carry():
+    hand = Hand(Mode.LIFT)
+    hand.feel((0, 0, -1.5 * (GRAVITY + 2.0)), acceleration=(0.0, 0.0, 2.0))
+    assert known_payload(hand.state) == pytest.approx(-1.5 * GRAVITY)
+    hand.feel((0, 0, -50.0))
+    assert known_payload(hand.state) == pytest.approx(-3.0 * GRAVITY)
+    hand.feel((0, 0, -10.0))
+    hand.state.mode = Mode.CARRY
+    # It is the last one felt until enough samples are weighed.
+    hand.feel((0, 0, -12.0), times=2)
+    assert known_payload(hand.state) == -10.0
+    hand.feel((0, 0, -12.0), times=20)
+    assert known_payload(hand.state) == pytest.approx(-12.0)
+    hand.state.mode = Mode.RELEASE
+    assert known_payload(hand.state) == 0.0
 
 
 def test_contact_below_the_travel_height_is_not_weighed():

@@ -40,7 +40,13 @@ def joint_torque(model: Model, q: NDArray[np.float64] = Q) -> NDArray[np.float64
 
 
 def estimate(
-    model: Model, torque: NDArray[np.float64], *, noise: float = 0.0, seed: int = 0, time: float = 0
+    model: Model,
+    torque: NDArray[np.float64],
+    *,
+    noise: float = 0.0,
+    seed: int = 0,
+    time: float = 0,
+    port: str = "wrist_force",
 ) -> NDArray[np.float64]:
     plant, gripper = model
     system = WristForce(arm=plant, gripper=gripper, step=STEP, noise=noise, seed=seed)
@@ -51,7 +57,7 @@ def estimate(
     system.GetInputPort("robot_state").FixValue(context, state)
     system.GetInputPort("joint_contact_torque").FixValue(context, torque)
     system.GetInputPort("finger_contact_force").FixValue(context, [5.0, -6.0])
-    return system.GetOutputPort("wrist_force").Eval(context).copy()
+    return system.GetOutputPort(port).Eval(context).copy()
 
 
 def test_ports(model: Model):
@@ -61,12 +67,26 @@ def test_ports(model: Model):
     assert system.num_input_ports() == len(inputs)
     for name, size in inputs.items():
         assert system.GetInputPort(name).size() == size
-    assert system.num_output_ports() == 1
+    outputs = {"wrist_force": 6, "wrist_moment": 1}
+    assert system.num_output_ports() == len(outputs)
+    for name, size in outputs.items():
+        assert system.GetOutputPort(name).size() == size
 
 
 def test_it_equals_the_applied_force(model: Model):
     found = estimate(model, joint_torque(model))
     np.testing.assert_allclose(found, [*FORCE, TORQUE[2], 5.0, -6.0], atol=1e-9)
+
+
+def test_the_moment_is_about_the_jaws_and_positive_for_a_load_in_front(model: Model):
+    plant, gripper = model
+    context = plant.CreateDefaultContext()
+    plant.SetPositions(context, np.append(Q, [0.01, 0.01]))
+    R_WG = gripper.CalcPoseInWorld(context).rotation()
+    (found,) = estimate(model, joint_torque(model), port="wrist_moment")
+    assert found == pytest.approx(TORQUE @ R_WG.col(1), abs=1e-9)
+    weight = np.array([0.0, 0.0, -1.0])
+    assert np.cross(R_WG.col(0), weight) @ R_WG.col(1) > 0.9
 
 
 def test_no_contact_is_no_force(model: Model):
