@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from pydrake.multibody.math import SpatialForce
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import MultibodyForces
 from pydrake.systems.framework import (
@@ -13,8 +14,8 @@ from pydrake.systems.framework import (
     LeafSystem,
 )
 
-from systems.arm_kinematics import jacobian
 from systems.arm_limits import JOINTS
+from systems.hand_geometry import FINGERTIP_DISTANCE
 from systems.trajectory_controller import FINGERS, FingerLaw
 
 _FOLLOWS = 0.05
@@ -87,7 +88,8 @@ class JointController(LeafSystem):
             raise ValueError(f"arm must have 9 positions, not {arm.num_positions()}")
         self._arm, self._step, self._fingers = arm, step, fingers
         # Scratch memory: each call overwrites the values before it reads them.
-        self._scratch, self._no_forces = arm.CreateDefaultContext(), MultibodyForces(arm)
+        self._scratch, self._forces = arm.CreateDefaultContext(), MultibodyForces(arm)
+        self._hand = arm.GetBodyByName("hand")
         joints, size = JOINTS, JOINTS + FINGERS
         self._load_index = self.DeclareDiscreteState(1)
         self.DeclarePeriodicDiscreteUpdateEvent(step, 0.0, self._follow_payload)
@@ -133,14 +135,19 @@ class JointController(LeafSystem):
         arm, scratch = self._arm, self._scratch
         a_d = self._desired_motion.Eval(context)[2 * JOINTS :]
         arm.SetPositionsAndVelocities(scratch, self._robot_state.Eval(context))
-        wanted = np.concatenate([a_d, np.zeros(FINGERS)])
-        torque = arm.CalcInverseDynamics(scratch, wanted, self._no_forces)[:JOINTS]
+        self._forces.SetZero()
         load = context.get_discrete_state(self._load_index).value()[0]
         if load:
-            # Heights in the base's frame and in the world differ by a constant, so their Jacobians
-            # are equal.
-            torque = torque - load * jacobian(arm.GetPositions(scratch)[:JOINTS])[5]
-        output.SetFromVector(torque)
+            R_WHand = self._hand.EvalPoseInWorld(scratch).rotation()
+            self._hand.AddInForce(
+                scratch,
+                p_BP_E=R_WHand @ np.array([0.0, 0.0, FINGERTIP_DISTANCE]),
+                F_Bp_E=SpatialForce(np.zeros(3), np.array([0.0, 0.0, load])),
+                frame_E=arm.world_frame(),
+                forces=self._forces,
+            )
+        wanted = np.concatenate([a_d, np.zeros(FINGERS)])
+        output.SetFromVector(arm.CalcInverseDynamics(scratch, wanted, self._forces)[:JOINTS])
 
     def _calc_fingers(self, context: Context, output: BasicVector) -> None:
         state = self._robot_state.Eval(context)

@@ -10,11 +10,12 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.math import SpatialVelocity
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame, RigidBody
 from pydrake.systems.framework import Context
-from scipy.spatial.transform import Rotation
 
 _LEAST_RATE = 0.05
 """If all joints are slower than this, nothing is corrected, in rad/s."""
@@ -61,20 +62,18 @@ class ArmPath:
         arm.SetPositionsAndVelocities(scratch, np.concatenate([q - h * v, v]))
         X_WG0: RigidTransform = self._gripper.CalcPoseInWorld(scratch)
         V_WG = self._gripper.CalcSpatialVelocityInWorld(scratch)
-        rate, speed = V_WG.rotational(), V_WG.translational()
         arm.SetPositions(scratch, q)
         X_moved = self._gripper.CalcPoseInWorld(scratch) @ X_WG0.inverse()
-        straight = RotationMatrix(Rotation.from_rotvec(h * rate).as_matrix())
-        R_moved = X_moved.rotation() @ straight.inverse()
+        R_moved = X_moved.rotation() @ _rotation(-h * V_WG.rotational())
         velocities = plant.GetVelocities(context)
         for body in free:
             start = body.floating_velocities_start_in_v()
-            w_WB, v_WBo = velocities[start : start + 3], velocities[start + 3 : start + 6]
+            V_WB = SpatialVelocity(velocities[start : start + 6])
             X_WB: RigidTransform = body.EvalPoseInWorld(context)
             p_BoBcm = X_WB.rotation() @ body.CalcCenterOfMassInBodyFrame(context)
-            v_WBcm = v_WBo + np.cross(w_WB, p_BoBcm)
+            v_WBcm = V_WB.Shift(p_BoBcm).translational()
             p_WBcm0 = X_WB.translation() + p_BoBcm - h * v_WBcm
-            carried = speed + np.cross(rate, p_WBcm0 - X_WG0.translation())
+            carried = V_WG.Shift(p_WBcm0 - X_WG0.translation()).translational()
             apart = np.linalg.norm(v_WBcm - carried)
             if apart > _SAME_SPEED + 0.05 * np.linalg.norm(carried):
                 continue
@@ -82,3 +81,9 @@ class ArmPath:
             R_WB = RotationMatrix.ProjectToRotationMatrix((R_moved @ X_WB.rotation()).matrix())
             p_WBo = X_WB.translation() + p_BoBcm + arc - R_moved @ p_BoBcm
             plant.SetFreeBodyPose(context, body, RigidTransform(R_WB, p_WBo))
+
+
+def _rotation(vector: NDArray[np.float64]) -> RotationMatrix:
+    """The rotation about a vector by its length, in rad."""
+    angle = float(np.linalg.norm(vector))
+    return RotationMatrix(AngleAxis(angle, vector / angle)) if angle else RotationMatrix()
