@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -58,6 +59,32 @@ _OUTER = (_FOREARM, _WRIST, _LAST, _HAND)
 """The links that could hit the arm's own base."""
 _LEAST = 0.01
 """Smaller distances count as collisions, in m."""
+_POINTS = 7
+"""Cross sections of a capsule."""
+
+
+def link_points(q: NDArray[np.float64], base: ArmBase) -> NDArray[np.float64]:
+    """(n, 3) points all over the capsules of the arm, without the hand, in the world.
+
+    Args:
+        q: (7) joint positions.
+        base: where the arm stands.
+    """
+    rotations, origins = joint_frames(q)
+    directions = np.array(list(itertools.product((-1.0, 0.0, 1.0), repeat=3)))
+    lengths = np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1.0)
+    share = np.linspace(0.0, 1.0, _POINTS)[:, None, None]
+
+    def points(capsule: Capsule) -> NDArray[np.float64]:
+        start, end = np.array(capsule.start), np.array(capsule.end)
+        around = capsule.radius * directions / lengths
+        return (start + share * (end - start) + around).reshape(-1, 3)
+
+    found = [points(capsule) for capsule in _BASE]
+    for link in (_UPPER_ARM, *_ABOVE):
+        placed = points(link.capsule) @ rotations[link.frame].T
+        found.append(placed + origins[link.frame])
+    return base.to_world(np.concatenate(found))
 
 
 def collision(

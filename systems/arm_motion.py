@@ -275,22 +275,34 @@ class ArmMotion(JawMotion):
         reached."""
         now = way.start[:JOINTS]
         y = float(self.postures.hand_pose(now)[1])
-        x, home_y, _, yaw = self._parameters.home
-        z = max(self._wait_height, float(state.travel_z))
-        goal = self.home_joints
-        for share in (1.0, 0.75, 0.5, 0.25):
-            between = home_y + share * (y - home_y)
-            stop = HandStop("home", x, between, yaw, low=z, high=z, surface=state.table_z)
-            found, problem = self.postures.choose([stop], now)
-            if not problem:
-                goal = found[0]
-                break
-        way.over, way.sink = goal, z
+        way.sink = max(self._wait_height, float(state.travel_z))
+        way.over = self.waiting_joints(y, now, float(state.table_z), float(way.sink))
         # After a stop by the force guard the jaws may drag an object along, so rise to the higher
         # travel height.
         way.clear = state.travel_z if state.stops else state.clear_z
         # Do not turn joint 7 back: it would take longer than the other joints.
         way.over[6] = now[6]
+
+    def waiting_joints(
+        self, y: float, now: NDArray[np.float64], surface: float, z: float | None = None
+    ) -> NDArray[np.float64]:
+        """(7) joint positions at the home's x, and at a y or as near to it as the arm can be.
+
+        Args:
+            y: in m.
+            now: (7) present joint positions.
+            surface: height of the surface below, in m.
+            z: height of the fingertips in m; None: the one at which the hand waits.
+        """
+        x, home_y, _, yaw = self._parameters.home
+        z = self._wait_height if z is None else z
+        for share in (1.0, 0.75, 0.5, 0.25):
+            between = home_y + share * (y - home_y)
+            stop = HandStop("home", x, between, yaw, low=z, high=z, surface=surface)
+            found, problem = self.postures.choose([stop], now)
+            if not problem:
+                return found[0]
+        return self.home_joints
 
     def slow_down(self, state: PlannerState, time: float, share: float) -> None:
         """Does nothing: the limits of the joints rule. See `RobotMotion`."""

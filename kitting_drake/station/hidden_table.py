@@ -1,4 +1,4 @@
-"""Checks whether the waiting hand hides part of the table from a camera."""
+"""Checks whether the waiting robot hides part of the table from a camera."""
 
 import itertools
 
@@ -7,50 +7,89 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from kitting_drake.scenario.cameras import Camera, camera_pose, depth_camera
+from kitting_drake.scenario.robots import FrankaArm
 from kitting_drake.scenario.schema import Scenario
-from systems.hand_geometry import FINGERTIP_DISTANCE, PALM_SIZE
+from systems.arm_collisions import link_points
+from systems.arm_limits import ARM_LIMITS
+from systems.arm_motion import ArmMotion
+from systems.hand_geometry import (
+    FINGER_DEPTH,
+    FINGER_LENGTH,
+    FINGERTIP_DISTANCE,
+    MAX_OPENING,
+    PALM_HEIGHT,
+    PALM_SIZE,
+)
 from systems.signals import PixelGrid
 
 _YAWS = np.deg2rad([0.0, 45.0, 90.0, 135.0])
 _PLACES = 9
 """Number of waiting positions to check along the workspace's y axis, because the hand may wait at
 any y."""
+_BORDER = 0.015
+"""Width of the border of the workspace that may be hidden, in m: no object fits in there."""
 
 
 def hidden_table_note(scenario: Scenario) -> str | None:
-    """A warning if the waiting hand hides part of the workspace from a camera; else None.
+    """A warning if the waiting robot hides part of the workspace from a camera; else None.
 
     Unless another camera sees the hidden part, it is a hole in o_t.
+
+    Raises:
+        ValueError: an arm cannot reach the home pose.
     """
     grid = scenario.heightmap.grid()
-    p_WPoints = _waiting_hand(scenario.planner.home, grid)
+    x, y, z, yaw = scenario.planner.home
+    along_y = [y, *np.linspace(grid.y_min, grid.y_max, _PLACES).tolist()]
+    robot, arm = scenario.robot, np.empty((0, 3))
+    who, advice = "hand", "choose another home, such as [-0.4, 0, 0.4, 0]"
+    if isinstance(robot, FrankaArm):
+        who, advice = "arm", "choose another home, or place the camera elsewhere"
+        z = min(z, robot.highest_wait)
+        arm = _waiting_arm(scenario, robot, along_y)
+    p_WPoints = np.concatenate([_waiting_hand((x, z, yaw), along_y), arm])
     names = [name for name, config in scenario.cameras.items() if _hides(p_WPoints, config, grid)]
     if not names:
         return None
     which = f"camera {names[0]}" if len(names) == 1 else f"cameras {', '.join(names)}"
-    return (
-        f"where the hand waits (planner.home) it hides part of the table from {which}: choose "
-        "another home, such as [-0.4, 0, 0.4, 0]"
-    )
+    return f"where the {who} waits (planner.home) it hides part of the table from {which}: {advice}"
 
 
-def _waiting_hand(home: list[float], grid: PixelGrid) -> NDArray[np.float64]:
-    """(n, 3) points of boxes around the hand, at all waiting positions, in the world, in metres."""
-    half_x, half_y = PALM_SIZE[0] / 2, PALM_SIZE[1] / 2
-    p_GPoints = np.stack(
-        np.meshgrid(
-            np.linspace(-half_x, half_x, 3),
-            np.linspace(-half_y, half_y, 5),
-            np.linspace(0.0, FINGERTIP_DISTANCE, 4),
-        ),
-        axis=-1,
-    ).reshape(-1, 3)
-    x, y, z, yaw = home
+def _waiting_hand(home: tuple[float, float, float], along_y: list[float]) -> NDArray[np.float64]:
+    """(n, 3) points of boxes around the hand, at all waiting positions, in the world, in metres.
+
+    Args:
+        home: x, z and yaw.
+        along_y: where the hand may wait.
+    """
+    palm = _box(PALM_SIZE, PALM_HEIGHT, FINGERTIP_DISTANCE)
+    fingers = _box((FINGER_LENGTH, MAX_OPENING + 2 * FINGER_DEPTH), 0.0, PALM_HEIGHT)
+    p_GPoints = np.concatenate([palm, fingers])
+    x, z, yaw = home
     found = []
-    for at_y, turn in itertools.product([y, *np.linspace(grid.y_min, grid.y_max, _PLACES)], _YAWS):
-        X_WG = RigidTransform(RollPitchYaw(0, 0, yaw + turn), [x, at_y, z])
+    for y, turn in itertools.product(along_y, _YAWS):
+        X_WG = RigidTransform(RollPitchYaw(0, 0, yaw + turn), [x, y, z])
         found.append(X_WG.multiply(p_GPoints.T).T)
     return np.concatenate(found)
+
+
+def _box(size: tuple[float, float], low: float, high: float) -> NDArray[np.float64]:
+    """(n, 3) points of a box between two heights, around the z axis, in m."""
+    x, y = size
+    axes = np.linspace(-x / 2, x / 2, 3), np.linspace(-y / 2, y / 2, 5), np.linspace(low, high, 3)
+    return np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3)
+
+
+def _waiting_arm(scenario: Scenario, robot: FrankaArm, along_y: list[float]) -> NDArray[np.float64]:
+    """(n, 3) points of an arm's links, likewise."""
+    motion = ArmMotion(
+        scenario.planner,
+        ARM_LIMITS[robot.model],
+        robot.arm_base(),
+        highest_wait=robot.highest_wait,
+    )
+    postures = [motion.waiting_joints(y, motion.home_joints, surface=0.0) for y in along_y]
+    return np.concatenate([link_points(q, robot.arm_base()) for q in postures])
 
 
 def _hides(p_WPoints: NDArray[np.float64], camera: Camera, grid: PixelGrid) -> bool:
@@ -69,4 +108,7 @@ def _hides(p_WPoints: NDArray[np.float64], camera: Camera, grid: PixelGrid) -> b
     down = in_image & (rays[:, 2] < -1e-6)
     along = (grid.z_min - p_WC[2]) / np.where(down, rays[:, 2], -1.0)
     p_WTable = p_WC + along[:, np.newaxis] * rays
-    return bool(grid.contains(p_WTable[down & (along > 1), :2]).any())
+    x, y, _ = p_WTable[down & (along > 1)].T
+    inside_x = (x > grid.x_min + _BORDER) & (x < grid.x_max - _BORDER)
+    inside_y = (y > grid.y_min + _BORDER) & (y < grid.y_max - _BORDER)
+    return bool((inside_x & inside_y).any())

@@ -4,6 +4,7 @@ import pytest
 
 from kitting_drake.scenario import Scenario
 from kitting_drake.scenario.cameras import LookAt, Pinhole
+from kitting_drake.scenario.robots import FrankaArm
 from kitting_drake.station.hidden_table import hidden_table_note
 from systems.pick_place_parameters import PickPlaceParameters
 
@@ -21,6 +22,21 @@ def test_an_overhead_camera_sees_the_waiting_hand_at_the_default_home(camera: Pi
     scenario = dataclasses.replace(scenario, cameras={**scenario.cameras, "overhead": camera})
     assert "camera overhead" in hidden_table_note(scenario)
     assert hidden_table_note(dataclasses.replace(scenario, planner=BESIDE)) is None
+
+
+@pytest.mark.parametrize("model", ["fr3", "panda"])
+def test_the_default_cameras_see_all_of_the_table_beside_an_arm(model: str):
+    assert hidden_table_note(Scenario(robot=FrankaArm(model=model))) is None
+
+
+def test_a_waiting_arm_hides_more_than_its_hand():
+    # Behind the arm, which a hand alone would not hide.
+    behind = LookAt(position=[-0.25, 0.0, 0.9])
+    hand = Scenario(cameras={"behind": behind})
+    assert hidden_table_note(hand) is None
+    note = hidden_table_note(dataclasses.replace(hand, robot=FrankaArm()))
+    assert "where the arm waits" in note
+    assert "camera behind" in note
 
 
 def test_the_hand_may_wait_at_any_y():
