@@ -21,8 +21,12 @@ WAYS = (Mode.APPROACH, Mode.DESCEND, Mode.LIFT, Mode.LOWER, Mode.SEARCH, Mode.RE
 HIGHEST = 0.05
 
 
-def motion_of(limits: ArmLimits = FR3, obstacles: tuple[Capsule, ...] = ()) -> ArmMotion:
-    return ArmMotion(PARAMETERS, limits, BASE, obstacles)
+def motion_of(
+    limits: ArmLimits = FR3,
+    obstacles: tuple[Capsule, ...] = (),
+    inertia: ArmInertia | None = None,
+) -> ArmMotion:
+    return ArmMotion(PARAMETERS, limits, BASE, obstacles, inertia=inertia)
 
 
 def set_action(state: ArmState, pick: tuple, place: tuple) -> None:
@@ -144,8 +148,10 @@ def test_the_hand_s_acceleration_is_that_of_the_joints():
         np.testing.assert_allclose(found, expected, atol=1.5)
 
 
-def test_the_hand_follows_its_heights():
-    motion = motion_of()
+@pytest.mark.parametrize("has_inertia", [False, True])
+def test_the_hand_follows_its_heights(has_inertia: bool):
+    inertia = ArmInertia(arm_model(FrankaArm())[0]) if has_inertia else None
+    motion = motion_of(inertia=inertia)
     state = motion.view(motion.initial_state())
     set_action(state, (0.6, 0.3, 0.4), (0.5, -0.3, 2.0))
     assert motion.prepare(state)
@@ -166,6 +172,7 @@ def test_the_hand_follows_its_heights():
     lift = tips[Mode.LIFT]
     away = np.linalg.norm(lift[:, :2] - (0.6, 0.3), axis=1)
     near = np.linalg.norm(lift[:, :2] - (0.5, -0.3), axis=1)
+    # Averaged corners dip a little.
     assert lift[(away > 0.007) & (near > 0.021), 2].min() > state.travel_z - 0.004
     assert lift[-1, 2] == pytest.approx(state.place_hover_z)
     for mode, goal in ((Mode.DESCEND, (0.6, 0.3)), (Mode.LOWER, (0.5, -0.3))):
