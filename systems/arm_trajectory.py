@@ -167,7 +167,7 @@ def plan_action(
 
     Contacts are not known in advance. So the arm descends to the grasp height, the jaws get the
     time to close and to open fully, and the held object is lowered to the surface that o_t shows at
-    its place.
+    its place. But the fingertips stay above the rim of a cavity, so the object may drop into it.
 
     Args:
         motion: plans the arm's motions.
@@ -304,9 +304,11 @@ class _Recorder:
         motion.begin(state, mode, begun)
         lowest = state.table_z + self._parameters.floor_clearance
         if mode == Mode.LOWER:
-            # Lower the object to the surface that o_t shows at the place, not to the table.
+            # Lower the object to the surface that o_t shows at the place, not to the table. The
+            # fingers may meet the rim before that, and no contact stops them here.
             hanging = max(state.grasp_z - state.support_z, 0.0)
-            motion.back_off(state, max(state.floor_z + hanging - lowest, 0.0))
+            goal = max(state.floor_z + hanging, state.rim_z + state.doubt)
+            motion.back_off(state, max(goal - lowest, 0.0))
         elif mode == Mode.DESCEND and state.press:
             # No contact stops the hand here, so keep its goal above the table.
             goal = state.pick_top_z - self._parameters.press_depth

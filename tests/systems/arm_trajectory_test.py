@@ -1,3 +1,4 @@
+import dataclasses
 import functools
 import itertools
 
@@ -20,9 +21,14 @@ SURFACES = SurfaceHeights(
 
 
 @functools.cache
-def plan(model: str = "fr3", action: PickPlaceAction = ACTION, rate: int = 1000) -> ArmTrajectory:
+def plan(
+    model: str = "fr3",
+    action: PickPlaceAction = ACTION,
+    rate: int = 1000,
+    surfaces: SurfaceHeights = SURFACES,
+) -> ArmTrajectory:
     motion = ArmMotion(PARAMETERS, ARM_LIMITS[model], ArmBase())
-    trajectory = plan_action(motion, PARAMETERS, action, SURFACES, rate=rate)
+    trajectory = plan_action(motion, PARAMETERS, action, surfaces, rate=rate)
     assert isinstance(trajectory, ArmTrajectory), trajectory
     return trajectory
 
@@ -56,13 +62,21 @@ def test_the_hand_is_where_the_action_says():
         it.mode: motion.postures.hand_pose(trajectory.positions[it.last])
         for it in trajectory.segments
     }
-    # The fingertips grip 10 mm below the top. The place's floor is 30 mm above the pick's.
+    # The fingertips grip 10 mm below the top. At the place they stop at the cavity's rim.
     np.testing.assert_allclose(ends["DESCEND"][:3], [0.45, 0.2, 0.01], atol=1e-3)
-    np.testing.assert_allclose(ends["LOWER"][:3], [0.55, -0.1, 0.04], atol=1e-3)
+    np.testing.assert_allclose(ends["LOWER"][:3], [0.55, -0.1, 0.05], atol=1e-3)
     turned = ends["LOWER"][3] - ends["DESCEND"][3]
     assert np.remainder(turned, 2 * np.pi) == pytest.approx(0.9, abs=1e-3)
     assert ends["CARRY"][2] > 0.07
     assert ends["RETREAT"][2] == pytest.approx(PARAMETERS.home[2], abs=1e-3)
+
+
+def test_the_object_is_lowered_to_the_floor_where_the_fingers_have_room():
+    shallow = dataclasses.replace(SURFACES, place_rim=0.035)
+    trajectory, motion = plan(surfaces=shallow), ArmMotion(PARAMETERS, FR3, ArmBase())
+    end = next(it.last for it in trajectory.segments if it.mode == "LOWER")
+    # The fingertips hold the object 10 mm above its bottom, which stands on the place's floor.
+    assert motion.postures.hand_pose(trajectory.positions[end])[2] == pytest.approx(0.04, abs=1e-3)
 
 
 def test_segments_and_jaws():
