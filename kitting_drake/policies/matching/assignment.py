@@ -51,7 +51,7 @@ def match(segmentation: Segmentation, resolution: float) -> list[Pair]:
         segmentation: the segmentation of an observation.
         resolution: the side of its pixels, in metres.
     """
-    objects, regions = segmentation.objects, segmentation.recesses
+    objects, regions = segmentation.objects, segmentation.unfilled_recesses
     if not objects or not regions:
         return []
     outlines = [trace_outline(item.mask, resolution, close=True) for item in objects]
@@ -65,8 +65,9 @@ def match(segmentation: Segmentation, resolution: float) -> list[Pair]:
             costs[i, j] = mismatch(fits[i, j], objects[i], regions[j])
     # Clip the costs, so that one hopeless pair does not outweigh all others.
     rows, cols = linear_sum_assignment(np.minimum(costs, _WORST_COST))
+    index = {id(item): index for index, item in enumerate(segmentation.recesses)}
     pairs = [
-        Pair(i, j, fits[i, j], float(costs[i, j]))
+        Pair(i, index[id(regions[j])], fits[i, j], float(costs[i, j]))
         for i, j in zip(rows.tolist(), cols.tolist(), strict=True)
         if costs[i, j] < _WORST_COST
     ]

@@ -102,7 +102,8 @@ def refine_place(
         return None
     outline = trace_outline(taken.mask, resolution, close=True)
     goal = place + rotation_matrix(rotation) @ (outline.middle - pick)
-    recess = nearest_region(segmentation.recesses, goal)
+    unfilled = segmentation.unfilled_recesses
+    recess = nearest_region(unfilled, goal)
     if recess is None:
         return None
     target = trace_outline(recess.mask, resolution)
@@ -129,7 +130,7 @@ def refine_place(
             best = pair.fit
     if best is None or best.cost > _WORST_COST:
         return None
-    others = [other for other in segmentation.recesses if other is not recess]
+    others = [other for other in unfilled if other is not recess]
     elsewhere = _better_elsewhere(taken, outline, recess, target, best, others, resolution)
     if elsewhere is not None:
         best = elsewhere

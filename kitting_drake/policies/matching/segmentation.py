@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,6 +72,8 @@ pixels, or the second in metres if that is more."""
 _FLAT, _FLAT_SHARE = 0.0006, 0.7
 """A recess is free if its floor is flat: more than the share `_FLAT_SHARE` of the floor is within
 `_FLAT`, in metres, of one height. If twice the noise is more than `_FLAT`, it is used instead."""
+_BELOW_TOP = 0.001
+"""Surfaces deeper than this are below the fixture's top, in metres."""
 _NOISY = 0.001
 """If the noise has a larger standard deviation than this, a floor cannot be distinguished from an
 object, in metres."""
@@ -154,15 +157,28 @@ class Segmentation:
     def free_recesses(self) -> tuple[Region, ...]:
         """The recesses that are seen and have a flat floor.
 
-        Other recesses contain an object: the gaps around it are narrow, and the object itself is
-        not flat.
+        Other recesses contain an object: the gaps around it are narrow, the object itself is not
+        flat, or some of it ends just below the fixture's top.
         """
         return tuple(
             item
             for item in self.recesses
-            if _inner_radius(item.mask) > max(_GAP, _LEAST_GAP / self.visibility.resolution)
-            and self.visibility.seen[item.mask].mean() > _RECESS_SEEN
-            and self._is_flat(item)
+            if self._is_wide(item) and self._is_flat(item) and not self._is_fragment(item)
+        )
+
+    @property
+    def unfilled_recesses(self) -> tuple[Region, ...]:
+        """The recesses into which an object might fit: all but those that clearly contain one.
+
+        These are the `free_recesses` and narrow ones. If there is noise, they are all recesses,
+        because an object in a recess may then look like its floor.
+        """
+        if self.noise > _CLEAN:
+            return self.recesses
+        return tuple(
+            item
+            for item in self.recesses
+            if not self._is_fragment(item) and (self._is_flat(item) or not self._is_wide(item))
         )
 
     @property
@@ -177,6 +193,32 @@ class Segmentation:
         for region in self.objects:
             taken |= region.mask
         return np.asarray(taken)
+
+    def _is_wide(self, recess: Region) -> bool:
+        """Whether a recess is wider than the gap around an object, and seen."""
+        return bool(
+            _inner_radius(recess.mask) > max(_GAP, _LEAST_GAP / self.visibility.resolution)
+            and self.visibility.seen[recess.mask].mean() > _RECESS_SEEN
+        )
+
+    @cached_property
+    def _low(self) -> NDArray[np.int32]:
+        """(rows, cols): labels of the connected parts of the fixture below its top."""
+        return np.asarray(ndimage.label(self.depth > _BELOW_TOP, _NEIGHBOURS)[0])
+
+    def _is_fragment(self, recess: Region) -> bool:
+        """Whether a recess is only the visible fragment of a filled one.
+
+        Most of the recess then has an object's top just below the fixture's. Thin slots whose floor
+        no camera sees look alike, but are smaller than the rest of their recess.
+        """
+        if self.noise > _CLEAN:
+            return False
+        labels = np.unique(self._low[recess.mask])
+        reach = max(2, round(_FIXTURE_MARGIN / self.visibility.resolution))
+        near = ndimage.binary_dilation(recess.mask, _NEIGHBOURS, iterations=reach)
+        beside = np.isin(self._low, labels[labels > 0]) & (self.depth < _RECESS_DEPTH) & ~near
+        return bool(beside.sum() > recess.mask.sum())
 
     def _is_flat(self, recess: Region) -> bool:
         if self.noise > _NOISY:

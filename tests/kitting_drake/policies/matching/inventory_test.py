@@ -120,6 +120,25 @@ def test_a_recess_that_was_filled_is_not_left_over():
     assert len(Inventory.of(placed).left_over.cavities) == 1
 
 
+def test_the_visible_parts_of_a_filled_recess_are_not_free():
+    """A box beside a full kit is as large as what is left of the hammer's recess, and stays."""
+    box = np.zeros(GRID.shape, bool)
+    box[60:70, 180:205] = True
+    observation = scene((box, 0.015), filled=True)
+    # The hammer's head is deeper than the least depth of a recess, and its shaft is not.
+    seated = observation.height.copy()
+    seated[hammer(30, 35)] = 0.048
+    seated[30:54, 77:85] = 0.0465
+    image = observation.image.copy()
+    image[3] = seated
+    observation = dataclasses.replace(observation, image=image)
+    found = Inventory.of(observation)
+    assert found.segmentation.kit_seen and not found.segmentation.unfilled_recesses
+    action = ShapeMatchingPolicy(PLANNER, recover=True)(observation)
+    assert action.stop and action.reason == "done"
+    assert action.left_over is not None and not action.left_over.cavities
+
+
 def test_two_kits_are_seen():
     height = scene((hammer(60, 180), 0.015)).height.copy()
     height[20:110, 250:310] = 0.04
