@@ -1,5 +1,6 @@
 """Frames of the simulated cell's cameras, as files and as a bench has them."""
 
+import dataclasses
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 from pydrake.geometry import Box, ColorRenderCamera
-from pydrake.math import RigidTransform
+from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import Context, DiagramBuilder
 
@@ -19,7 +20,7 @@ from kitting_drake.real_camera.checking.kit_block import Block
 from kitting_drake.real_camera.frames import Frame
 from kitting_drake.scenario.cameras import camera_pose, depth_camera
 from kitting_drake.scenario.schema import Scenario
-from systems.signals import Observation, PickPlaceAction
+from systems.signals import Observation, PickPlaceAction, PlanarPose
 from tests.kitting_drake.rig import Rig, build_rig
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -82,6 +83,27 @@ def difference(one: PickPlaceAction, other: PickPlaceAction) -> NDArray[np.float
             math.degrees(abs(math.remainder(turned - other_turned, math.tau))),
         ]
     )
+
+
+def true_action(found: Rendered, action: PickPlaceAction) -> tuple[str, PickPlaceAction]:
+    """The name of the object that is picked, and the action that would bring it exactly to its
+    goal."""
+    pick = np.array([action.pick.x, action.pick.y])
+    scene = found.rig.scene
+
+    def away(index: int) -> float:
+        item = scene.objects[index]
+        points = item.X_WB.multiply(item.p_BPoints.T)[:2].T
+        return float(np.linalg.norm(points - pick, axis=1).min())
+
+    index = min(range(len(scene.objects)), key=away)
+    item = scene.objects[index]
+    goal = next(goal for goal in scene.goals if index in goal.objects)
+    moved = goal.poses[0].multiply(item.X_WB.inverse())
+    place = moved.multiply(np.append(pick, 0.0))
+    theta = action.pick.theta + RollPitchYaw(moved.rotation()).yaw_angle()
+    exact = PlanarPose(float(place[0]), float(place[1]), theta)
+    return item.name, dataclasses.replace(action, place=exact)
 
 
 def cast(calibration: Calibration, block: Block | None = None) -> dict[str, Frame]:
