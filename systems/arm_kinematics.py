@@ -113,6 +113,20 @@ def fingertips(q: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack([x, y, z], -1)
 
 
+def uprightness(q: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(...) cosine of the angle between the hand's axis and straight down, at joint positions
+    (..., 7)."""
+    x = y = np.zeros(np.shape(q)[:-1])
+    z = x + 1.0
+    cos, sin = np.cos(q), np.sin(q)
+    for i in reversed(range(JOINTS)):
+        c, s = cos[..., i], sin[..., i]
+        x, y = c * x - s * y, s * x + c * y
+        if _TWIST[i]:
+            y, z = -_TWIST[i] * z, _TWIST[i] * y
+    return -z
+
+
 def jacobian(q: NDArray[np.float64]) -> NDArray[np.float64]:
     """(..., 6, 7) Jacobian at joint positions (..., 7), in B: three rows of angular velocity, then
     three of the fingertips' translational velocity."""

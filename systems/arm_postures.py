@@ -18,6 +18,7 @@ from systems.arm_kinematics import (
     inverse,
     joint_seven,
     planar,
+    uprightness,
 )
 from systems.arm_limits import JOINTS, ArmLimits
 
@@ -30,6 +31,9 @@ _CHECKED = 12
 """Number of points of a path that are checked for collisions."""
 _JUMP = 1.5
 """Largest change of a joint on a straight line up or down, in rad."""
+_TILT = math.radians(2.0)
+"""Largest tilt of the hand on the way from one stop to the next, in rad. One end of a long object
+would hang lower."""
 _PLANAR = 1e-6
 """If the swivel is smaller than this, in rad, the arm counts as in the vertical plane."""
 
@@ -114,7 +118,7 @@ class ArmPostures:
         self, stops: Sequence[HandStop], now: NDArray[np.float64]
     ) -> tuple[list[NDArray[np.float64]], str]:
         """Chooses postures at the high ends of one or more stops, so that the whole motion is
-        short.
+        short, and the hand stays upright from one stop to the next.
 
         The jaws are symmetric: the yaws of all stops may be rotated by pi together.
 
@@ -139,7 +143,7 @@ class ArmPostures:
             if not found:
                 return [], self._problem(stop)
         names = " and ".join(stop.name for stop in stops)
-        return [], f"no turn of the hand keeps joint 7 inside its range at both {names}"
+        return [], f"no postures of the arm at {names} keep the hand upright on the way"
 
     def _problem_on_the_way(self, stops: Sequence[HandStop], way: list[NDArray[np.float64]]) -> str:
         share = np.linspace(0.0, 1.0, _CHECKED)[:, None]
@@ -164,11 +168,9 @@ class ArmPostures:
             for found in options:
                 following = []
                 for turned, q in found:
-                    if turned == half_turn:
-                        time, way = min(
-                            ((t + self._time(w[-1], q), w) for t, w in ways), key=lambda it: it[0]
-                        )
-                        following.append((time, [*way, q]))
+                    found_way = self._fastest_to(q, ways) if turned == half_turn else None
+                    if found_way is not None:
+                        following.append(found_way)
                 ways = following
                 if not ways:
                     break
@@ -177,11 +179,28 @@ class ArmPostures:
                     least, best = time, way[1:]
         return best
 
-    def _time(self, start: NDArray[np.float64], end: NDArray[np.float64]) -> float:
-        """Approximate time of a straight motion in joint space, in s."""
-        way = np.abs(end - start)
+    def _fastest_to(
+        self, q: NDArray[np.float64], ways: list[tuple[float, list[NDArray[np.float64]]]]
+    ) -> tuple[float, list[NDArray[np.float64]]] | None:
+        """The fastest way to a posture, with its time; None if each way would tilt the hand while
+        it may hold an object.
+
+        Args:
+            q: (7) the posture.
+            ways: times and postures of the ways so far, each from the present posture.
+        """
+        starts = np.array([way[-1] for _, way in ways])
+        times = np.array([time for time, _ in ways]) + self._times(starts, q)
+        if len(ways[0][1]) > 1:
+            times[~_stays_upright(starts, q)] = np.inf
+        best = int(np.argmin(times))
+        return (float(times[best]), [*ways[best][1], q]) if np.isfinite(times[best]) else None
+
+    def _times(self, starts: NDArray[np.float64], end: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(n) approximate times of straight motions in joint space from (n, 7) postures, in s."""
+        way = np.abs(end - starts)
         top = np.minimum(self._velocity, np.sqrt(way * self._acceleration))
-        return float((way / np.maximum(top, 1e-9) + top / self._acceleration).max())
+        return np.asarray((way / np.maximum(top, 1e-9) + top / self._acceleration).max(-1))
 
     def _options(
         self, stop: HandStop, swivels: NDArray[np.float64]
@@ -257,6 +276,12 @@ class ArmPostures:
             return f"{where} would take joint 7 out of its range"
         heights = f"between {stop.low:.3f} and {stop.high:.3f} m"
         return f"{where} is out of the arm's reach at heights {heights}"
+
+
+def _stays_upright(starts: NDArray[np.float64], end: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """(n) whether the hand tilts little on straight lines in joint space from (n, 7) postures."""
+    share = np.array([0.25, 0.5, 0.75])[:, None, None]
+    return np.asarray((uprightness(starts + share * (end - starts)) > math.cos(_TILT)).all(0))
 
 
 def _wrap(angle: NDArray[np.float64]) -> NDArray[np.float64]:

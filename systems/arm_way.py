@@ -26,6 +26,8 @@ _ROUNDING, _WIDER = 0.15, 0.3
 """Length of the path over which corners are rounded, in the same measure as `_SPACING`: if the path
 has two corners, and if it has one."""
 _FEWEST, _MOST = 40, 200
+_TRIES, _PATIENCE = 8, 3
+"""How often a path that crosses too low is raised at most, and after how many tries by more."""
 _ANY_ACCELERATION = 1e3
 """Acceleration of the yaw on a straight line, in rad/s^2. It is so large that only the joints'
 limits matter."""
@@ -210,7 +212,7 @@ class ArmWay:
         rounding = _WIDER if single else _ROUNDING
         raised = 0.0
         path = None
-        for _ in range(6):
+        for attempt in range(_TRIES):
             pieces = [self._up(q, way.clear + raised)]
             down = self._down(over, end, max(way.clear + raised, way.sink), way.sink)
             path = self._evenly(np.concatenate([*pieces, down]), rounding)
@@ -219,7 +221,8 @@ class ArmWay:
             missing = self._missing(path, way.clear)
             if missing <= 0.001:
                 return path
-            raised += missing + 0.005
+            # Near a rounded corner a little more height may not help, so raise it ever more.
+            raised += (missing + 0.005) * 2 ** max(attempt - _PATIENCE, 0)
         if path is None:
             # The path has no length, so stay.
             points = np.repeat(q[None], 3, axis=0)

@@ -11,6 +11,7 @@ from systems.arm_kinematics import (
     jacobian,
     joint_frames,
     joint_seven,
+    uprightness,
 )
 from systems.arm_limits import FR3, PANDA
 
@@ -45,6 +46,11 @@ def test_the_hand_points_down_at_the_pose():
     # The arm stands in the vertical plane through its base and the hand.
     assert np.abs(solutions[:, [2, 4]]).max(axis=1).min() < 1e-6
     np.testing.assert_allclose(BASE.to_world(fingertips(solutions)), [pose[:3]] * len(solutions))
+
+
+def test_uprightness_is_the_cosine_of_the_tilt():
+    q = np.random.default_rng(1).uniform(-3.0, 3.0, (20, 7))
+    np.testing.assert_allclose(uprightness(q), -joint_frames(q)[0][:, 7, 2, 2], atol=1e-12)
 
 
 def test_velocities_are_derivatives_of_positions():

@@ -148,6 +148,24 @@ def test_the_hand_s_acceleration_is_that_of_the_joints():
         np.testing.assert_allclose(found, expected, atol=1.5)
 
 
+def test_the_hand_stays_upright_with_an_object_where_the_arm_leaves_its_vertical_plane():
+    motion = motion_of()
+    state = motion.view(motion.initial_state())
+    set_action(state, (0.39, 0.31, 1.44), (0.37, -0.13, 1.48))
+    assert motion.prepare(state)
+    assert abs(state.place_joints[2]) > 0.1
+    time = 0.0
+    for mode in (Mode.APPROACH, Mode.DESCEND, Mode.LIFT):
+        motion.begin(state, mode, time)
+        q = states(motion, state, time, motion.arrival(state))[:, :7]
+        time = motion.arrival(state)
+    assert joint_frames(q)[0][:, 7, 2, 2].max() < -math.cos(math.radians(3.0))
+    tips = BASE.to_world(fingertips(q))
+    away = np.linalg.norm(tips[:, :2] - state.pick[:2], axis=1)
+    near = np.linalg.norm(tips[:, :2] - state.place[:2], axis=1)
+    assert tips[(away > 0.007) & (near > 0.021), 2].min() > state.travel_z - 0.004
+
+
 @pytest.mark.parametrize("has_inertia", [False, True])
 def test_the_hand_follows_its_heights(has_inertia: bool):
     inertia = ArmInertia(arm_model(FrankaArm())[0]) if has_inertia else None
