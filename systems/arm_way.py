@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from systems.arm_inertia import ArmInertia
-from systems.arm_kinematics import fingertips
+from systems.arm_kinematics import fingertips, uprightness
 from systems.arm_limits import JOINTS
 from systems.arm_postures import ArmPostures
 from systems.arm_stop import ArmStop
+from systems.hand_geometry import FINGER_DEPTH, MAX_OPENING, PALM_HEIGHT, PALM_SIZE
 from systems.path_timing import TICK, RowLimits, SmoothMotion, plan_motion
 from systems.vector_view import Array, Number, VectorView
 
@@ -35,6 +36,8 @@ _NEARLY_THERE = 0.02
 """Within this horizontal distance of its end the hand may sink below the clear height, in m."""
 _STRAIGHT_UP = 0.006
 """Within this horizontal distance of its start the hand may still rise, in m."""
+_HALF_JAWS, _HALF_PALM = MAX_OPENING / 2 + FINGER_DEPTH, max(PALM_SIZE) / 2
+"""How far the open jaws and the palm reach to the side, in m."""
 _INSTANT = 1e-9
 _COARSE = 16
 """Every 16th sample is checked for collisions."""
@@ -248,10 +251,12 @@ class ArmWay:
     def _missing(self, path: _Path, clear: float) -> float:
         """How far the hand sinks below the clear height between start and end, in m; not positive
         if it stays above."""
-        tips = path.tips
+        tips, low = path.tips, path.tips[:, 2]
+        if path.points[:, [2, 4]].any():
+            low = low - _reach_below(path.points)
         away = np.linalg.norm(tips[:, :2] - tips[0, :2], axis=1) > _STRAIGHT_UP
         before = np.linalg.norm(tips[:, :2] - tips[-1, :2], axis=1) > _NEARLY_THERE
-        crossing = tips[away & before, 2]
+        crossing = low[away & before]
         return float(clear - crossing.min()) if len(crossing) else 0.0
 
     def _evenly(self, corners: NDArray[np.float64], rounding: float) -> _Path | None:
@@ -268,6 +273,14 @@ class ArmWay:
         for _ in range(2):
             points = _averaged(points, max(half, 1))
         return _Path(points, self._postures.base.to_world(fingertips(points)))
+
+
+def _reach_below(q: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n) how far the tilted hand reaches below the point between its fingertips, in m, at joint
+    positions (n, 7)."""
+    down = uprightness(q)
+    across = np.sqrt(1 - np.minimum(down, 1.0) ** 2)
+    return np.maximum(_HALF_JAWS * across, _HALF_PALM * across - PALM_HEIGHT * down)
 
 
 def _averaged(points: NDArray[np.float64], half: int) -> NDArray[np.float64]:
