@@ -226,6 +226,7 @@ class ArmMotion(JawMotion):
             way.speeds, way.yaw_speed = limits.speed, limits.yaw_speed
         elif mode in (Mode.LIFT, Mode.CARRY):
             way.over, way.clear, way.sink = state.place_joints, state.travel_z, state.place_hover_z
+            way.reach = _HELD_REACH
         elif mode == Mode.RETREAT:
             self._set_retreat(state, way)
         else:

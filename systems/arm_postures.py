@@ -31,9 +31,9 @@ _CHECKED = 12
 """Number of points of a path that are checked for collisions."""
 _JUMP = 1.5
 """Largest change of a joint on a straight line up or down, in rad."""
-_TILT = math.radians(2.0)
-"""Largest tilt of the hand on the way from one stop to the next, in rad. One end of a long object
-would hang lower."""
+_TILTS = (math.radians(2.0), math.radians(20.0), math.pi)
+"""Limits for the tilt of the hand on the way from one stop to the next, in rad: the least with
+which there is a way is used. One end of a long object would hang lower."""
 _PLANAR = 1e-6
 """If the swivel is smaller than this, in rad, the arm counts as in the vertical plane."""
 
@@ -118,7 +118,7 @@ class ArmPostures:
         self, stops: Sequence[HandStop], now: NDArray[np.float64]
     ) -> tuple[list[NDArray[np.float64]], str]:
         """Chooses postures at the high ends of one or more stops, so that the whole motion is
-        short, and the hand stays upright from one stop to the next.
+        short, and the hand tilts as little as possible from one stop to the next.
 
         The jaws are symmetric: the yaws of all stops may be rotated by pi together.
 
@@ -131,19 +131,25 @@ class ArmPostures:
             stops; it is empty if it can.
         """
         options: list[list[tuple[int, NDArray[np.float64]]]] = []
-        for swivels in (np.zeros(1), _SWIVELS):
+        problem = ""
+        for swivels, tilts in ((np.zeros(1), _TILTS[:1]), (_SWIVELS, _TILTS)):
             options = [
                 (options[i] if options else []) + self._options(stop, swivels)
                 for i, stop in enumerate(stops)
             ]
-            best = self._fastest(options, now)
-            if best:
-                return best, self._problem_on_the_way(stops, [now, *best])
+            for tilt in tilts:
+                best = self._fastest(options, now, tilt)
+                touches = self._problem_on_the_way(stops, [now, *best]) if best else ""
+                if best and not touches:
+                    return best, ""
+                problem = problem or touches
+        if problem:
+            return [], problem
         for stop, found in zip(stops, options, strict=True):
             if not found:
                 return [], self._problem(stop)
         names = " and ".join(stop.name for stop in stops)
-        return [], f"no postures of the arm at {names} keep the hand upright on the way"
+        return [], f"no turn of the hand keeps joint 7 inside its range at both {names}"
 
     def _problem_on_the_way(self, stops: Sequence[HandStop], way: list[NDArray[np.float64]]) -> str:
         share = np.linspace(0.0, 1.0, _CHECKED)[:, None]
@@ -158,7 +164,10 @@ class ArmPostures:
         return ""
 
     def _fastest(
-        self, options: list[list[tuple[int, NDArray[np.float64]]]], now: NDArray[np.float64]
+        self,
+        options: list[list[tuple[int, NDArray[np.float64]]]],
+        now: NDArray[np.float64],
+        tilt: float,
     ) -> list[NDArray[np.float64]]:
         best: list[NDArray[np.float64]] = []
         least = math.inf
@@ -168,7 +177,7 @@ class ArmPostures:
             for found in options:
                 following = []
                 for turned, q in found:
-                    found_way = self._fastest_to(q, ways) if turned == half_turn else None
+                    found_way = self._fastest_to(q, ways, tilt) if turned == half_turn else None
                     if found_way is not None:
                         following.append(found_way)
                 ways = following
@@ -180,19 +189,23 @@ class ArmPostures:
         return best
 
     def _fastest_to(
-        self, q: NDArray[np.float64], ways: list[tuple[float, list[NDArray[np.float64]]]]
+        self,
+        q: NDArray[np.float64],
+        ways: list[tuple[float, list[NDArray[np.float64]]]],
+        tilt: float,
     ) -> tuple[float, list[NDArray[np.float64]]] | None:
-        """The fastest way to a posture, with its time; None if each way would tilt the hand while
-        it may hold an object.
+        """The fastest way to a posture, with its time; None if each way would tilt the hand too far
+        while it may hold an object.
 
         Args:
             q: (7) the posture.
             ways: times and postures of the ways so far, each from the present posture.
+            tilt: limit of the tilt, in rad.
         """
         starts = np.array([way[-1] for _, way in ways])
         times = np.array([time for time, _ in ways]) + self._times(starts, q)
         if len(ways[0][1]) > 1:
-            times[~_stays_upright(starts, q)] = np.inf
+            times[_tilts(starts, q) > tilt] = np.inf
         best = int(np.argmin(times))
         return (float(times[best]), [*ways[best][1], q]) if np.isfinite(times[best]) else None
 
@@ -278,10 +291,12 @@ class ArmPostures:
         return f"{where} is out of the arm's reach at heights {heights}"
 
 
-def _stays_upright(starts: NDArray[np.float64], end: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """(n) whether the hand tilts little on straight lines in joint space from (n, 7) postures."""
+def _tilts(starts: NDArray[np.float64], end: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n) the hand's largest tilts on straight lines in joint space from (n, 7) postures, in
+    rad."""
     share = np.array([0.25, 0.5, 0.75])[:, None, None]
-    return np.asarray((uprightness(starts + share * (end - starts)) > math.cos(_TILT)).all(0))
+    least = uprightness(starts + share * (end - starts)).min(0)
+    return np.asarray(np.arccos(np.clip(least, -1.0, 1.0)))
 
 
 def _wrap(angle: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -69,6 +69,9 @@ class WayVector(VectorView):
     """Height of the fingertips above which the hand may travel."""
     sink = Number()
     """Height to which the hand sinks at the end of a path that crosses."""
+    reach = Number()
+    """How far a held object reaches to the side of the fingertips, where it hangs lower if the hand
+    tilts."""
     speed = Number()
     """Highest linear speed of the hand on a path that crosses. `acceleration` is the highest linear
     acceleration on any path."""
@@ -221,7 +224,7 @@ class ArmWay:
             path = self._evenly(np.concatenate([*pieces, down]), rounding)
             if path is None:
                 break
-            missing = self._missing(path, way.clear)
+            missing = self._missing(path, float(way.clear), float(way.reach))
             if missing <= 0.001:
                 return path
             # Near a rounded corner a little more height may not help, so raise it ever more.
@@ -248,12 +251,12 @@ class ArmWay:
         below = self._line(above[-1], low)
         return below if len(below) > 1 else above[-1:]
 
-    def _missing(self, path: _Path, clear: float) -> float:
-        """How far the hand sinks below the clear height between start and end, in m; not positive
-        if it stays above."""
+    def _missing(self, path: _Path, clear: float, reach: float) -> float:
+        """How far hand and object sink below the clear height between start and end, in m; not
+        positive if they stay above."""
         tips, low = path.tips, path.tips[:, 2]
         if path.points[:, [2, 4]].any():
-            low = low - _reach_below(path.points)
+            low = low - _reach_below(path.points, reach)
         away = np.linalg.norm(tips[:, :2] - tips[0, :2], axis=1) > _STRAIGHT_UP
         before = np.linalg.norm(tips[:, :2] - tips[-1, :2], axis=1) > _NEARLY_THERE
         crossing = low[away & before]
@@ -275,12 +278,17 @@ class ArmWay:
         return _Path(points, self._postures.base.to_world(fingertips(points)))
 
 
-def _reach_below(q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(n) how far the tilted hand reaches below the point between its fingertips, in m, at joint
-    positions (n, 7)."""
+def _reach_below(q: NDArray[np.float64], reach: float) -> NDArray[np.float64]:
+    """(n) how far the tilted hand and its object reach below the point between the fingertips, in
+    m.
+
+    Args:
+        q: (n, 7) joint positions.
+        reach: of the object to the side, in m; NaN if the hand is empty.
+    """
     down = uprightness(q)
     across = np.sqrt(1 - np.minimum(down, 1.0) ** 2)
-    return np.maximum(_HALF_JAWS * across, _HALF_PALM * across - PALM_HEIGHT * down)
+    return np.maximum(np.fmax(reach, _HALF_JAWS) * across, _HALF_PALM * across - PALM_HEIGHT * down)
 
 
 def _averaged(points: NDArray[np.float64], half: int) -> NDArray[np.float64]:
