@@ -20,6 +20,9 @@ from kitting_drake.scenario.choosing import find_scenario
 
 TOLERANCE_MM = 0.1
 """The standard deviation of the error of a printed cavity's walls, in mm on each side."""
+_OFF = "wrong height or heading"
+_TIGHT = ("insertion blocked", "misplaced", _OFF)
+"""The causes of failures that a wider cavity may mend."""
 GOOD = 0.95
 """A kit fits if at least this share of the tools is kitted."""
 _WIDER = (1.5, 2.25)
@@ -97,6 +100,12 @@ class KitProof:
         """Whether the share of kitted tools reaches `GOOD`."""
         return self.kitted >= GOOD * self.tried
 
+    @property
+    def may_be_tight(self) -> bool:
+        """Whether the kit does not fit, but might if no tool got stuck in its cavity."""
+        stuck = sum(tool.causes[cause] for tool in self.tools.values() for cause in _TIGHT)
+        return not self.fits and self.kitted + stuck >= GOOD * self.tried
+
 
 def prove_kit(folder: Path, episodes: int, progress: Progress) -> str:
     """Lets a policy fill a kit in simulation, and writes `proof.html` and `proof.json` into its
@@ -104,7 +113,7 @@ def prove_kit(folder: Path, episodes: int, progress: Progress) -> str:
 
     The policy is that of the kit's scenario. In each episode the tools lie elsewhere, and all
     cavities are wider or narrower by a common random error of `TOLERANCE_MM`. A kit that does not
-    fit is tried again with wider cavities.
+    fit is tried again with wider cavities, if the failures are such that these may help.
 
     Args:
         folder: a folder that `hkd kit` wrote.
@@ -122,7 +131,7 @@ def prove_kit(folder: Path, episodes: int, progress: Progress) -> str:
     fits = dict(record["kit_parameters_m"].get("clearance_of", {}))
     proof = _prove(folder, own, episodes, progress, fits)
     wider: list[KitProof] = []
-    for factor in () if proof.fits else _WIDER:
+    for factor in _WIDER if proof.may_be_tight else ():
         clearance = round(max(factor * own, own + _LEAST_WIDER_MM * (len(wider) + 1)), 2)
         more = {name: value + 1e-3 * (clearance - own) for name, value in fits.items()}
         wider.append(_prove(folder, clearance, episodes, progress, more))
@@ -194,7 +203,7 @@ def _prove(
             tool.tried += 1
             tool.kitted += item.strict_success
             if not item.strict_success:
-                tool.causes[item.cause or "wrong height or heading"] += 1
+                tool.causes[item.cause or _OFF] += 1
         for action in result.actions_taken:
             force = action.peak_force_n
             if action.object in proof.tools and force is not None:
@@ -218,7 +227,14 @@ def _verdict(proof: KitProof, wider: list[KitProof]) -> str:
     if worst.causes:
         trouble += f", mostly {worst.causes.most_common(1)[0][0]}"
     cure = next((item for item in wider if item.fits), None)
-    if cure is None:
+    if not wider:
+        advice = "Wider cavities would not help."
+        if worst.causes["slipped"]:
+            advice += (
+                " It slips from the hand: if it is lighter than its tool.yaml says, make it again "
+                "with --mass_g, else the hand has no good grasp of it."
+            )
+    elif cure is None:
         tried = " or ".join(f"{item.clearance_mm:g}" for item in wider)
         advice = f"A clearance of {tried} mm is not enough either."
     else:

@@ -10,9 +10,9 @@ from kitting_drake.evaluation.kit_proof import KitProof, ToolProof, _verdict, pr
 from kitting_drake.hkd.fabrication.export import KitRequest, export_kit
 
 
-def proof(clearance_mm: float, *kitted: int) -> KitProof:
+def proof(clearance_mm: float, *kitted: int, cause: str = "insertion blocked") -> KitProof:
     tools = {
-        name: ToolProof(name, count, 10, 12.0, Counter({"insertion blocked": 10 - count}))
+        name: ToolProof(name, count, 10, 12.0, Counter({cause: 10 - count}))
         for name, count in zip(("hammer", "pliers"), kitted, strict=True)
     }
     return KitProof(clearance_mm, tools)
@@ -26,6 +26,14 @@ def test_the_verdict_names_the_trouble_and_the_cure():
     assert "the worst tool is hammer (6 of 10 failed, mostly insertion blocked)" in bad
     assert "0.55 mm would be enough: 20 of 20" in bad
     assert "is not enough either" in _verdict(proof(0.15, 4, 10), [proof(0.35, 6, 10)])
+
+
+def test_wider_cavities_are_no_cure_for_tools_that_slip():
+    assert proof(0.15, 4, 10).may_be_tight
+    assert not proof(0.15, 10, 10).may_be_tight
+    slips = proof(0.15, 4, 10, cause="slipped")
+    assert not slips.may_be_tight
+    assert "would not help. It slips from the hand" in _verdict(slips, [])
 
 
 @pytest.mark.slow

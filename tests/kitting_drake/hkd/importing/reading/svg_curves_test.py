@@ -66,7 +66,9 @@ def test_a_drawing_has_the_size_that_its_program_meant(text: str, said: str, tmp
 def test_a_drawing_without_a_size_is_refused(root: str, tmp_path: Path):
     path = tmp_path / "tool.svg"
     path.write_text(svg(bar(), f'{root} viewBox="0 0 200 60"'))
-    with pytest.raises(UserError, match=r"200 mm if a unit is 1 mm, 71 mm .*1/72 inch, 53 mm .*1/96") as error:
+    with pytest.raises(
+        UserError, match=r"200 mm if a unit is 1 mm, 71 mm .*1/72 inch, 53 mm .*1/96"
+    ) as error:
         read_drawing(path)
     assert "--unit" in str(error.value)
     assert read_drawing(path, 1.0).outline.area() == pytest.approx(AREA, rel=2e-3)
