@@ -18,11 +18,11 @@ class ActionQuantizer:
     """N, the number of orientations; angles are rounded to multiples of 2 pi / N."""
 
     def position(self, x: float, y: float) -> tuple[float, float]:
-        """The pixel centre (x, y) nearest to a point, both in metres in the world."""
+        """Returns the pixel centre (x, y) nearest to a point. All are in the world, in metres."""
         pixel = np.clip(np.round(self.grid.to_pixel((x, y))), 0, np.array(self.grid.shape) - 1)
         rounded_x, rounded_y = self.grid.to_world(pixel)
         return float(rounded_x), float(rounded_y)
 
     def angle(self, theta: float) -> float:
-        """The one of the N orientations that is nearest to an angle, both in radians."""
+        """Rounds an angle, in radians, to the nearest of the N orientations."""
         return round(theta * self.orientations / math.tau) * math.tau / self.orientations

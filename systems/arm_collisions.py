@@ -24,8 +24,8 @@ class Capsule:
 
 @dataclass(frozen=True)
 class _Link:
-    """A capsule fixed to a joint's frame: frames 0 to 6 belong to joints 1 to 7, frame 7 to the
-    flange."""
+    """A capsule that is fixed to a frame: 0 to 6 are the frames of joints 1 to 7, 7 is the
+    flange's."""
 
     frame: int
     capsule: Capsule
@@ -54,21 +54,23 @@ _HAND = _Link(
 _UPPER_ARM = _Link(2, Capsule((0.0, 0.0, -0.20), (0.0, 0.0, -0.06), 0.06))
 _ELBOW = _Link(3, Capsule((0.0, 0.0, -0.06), (0.0, 0.0, 0.06), 0.06))
 _ABOVE = (_ELBOW, _FOREARM, _WRIST, _LAST)
-"""The links, besides the hand, that could come down onto the table and the objects."""
+"""The links that could hit the table or the objects. The hand is left out: its fingers work among
+them."""
 _OUTER = (_FOREARM, _WRIST, _LAST, _HAND)
 """The links that could hit the arm's own base."""
 _LEAST = 0.01
-"""Smaller distances count as collisions, in m."""
+"""Distances below this value, in m, count as collisions."""
 _POINTS = 7
-"""Cross sections of a capsule."""
+"""Number of cross sections of a capsule on which `link_points` places points."""
 
 
 def link_points(q: NDArray[np.float64], base: ArmBase) -> NDArray[np.float64]:
-    """(n, 3) points all over the capsules of the arm, without the hand, in the world.
+    """Returns (n, 3) points on the surfaces of the arm's capsules, in m in the world, without the
+    hand.
 
     Args:
-        q: (7) joint positions.
-        base: where the arm stands.
+        q: (7) joint positions, in rad.
+        base: pose of the arm's base in the world.
     """
     rotations, origins = joint_frames(q)
     directions = np.array(list(itertools.product((-1.0, 0.0, 1.0), repeat=3)))
@@ -94,7 +96,7 @@ def collision(
     obstacles: Sequence[Capsule] = (),
     held: float = 0.0,
 ) -> str:
-    """Names what the arm collides with at any of several joint positions; empty if nothing.
+    """Names what the arm collides with at any of the given joint positions; empty if nothing.
 
     Args:
         q: (n, 7) joint positions, in rad.
@@ -102,7 +104,7 @@ def collision(
         surface: world z of the highest surface around the hand, in m. The hand itself is not
             compared with it, because the fingers must go below it.
         obstacles: capsules around bodies that do not move, in the world.
-        held: how far a held object reaches from the fingertips, in m; zero if there is none.
+        held: how far a held object reaches from the fingertips, in m; zero if the hand is empty.
     """
     rotations, origins = joint_frames(q)
 
@@ -117,7 +119,7 @@ def collision(
     for link in _ABOVE:
         lowest = np.minimum(*(end[:, 2] for end in placed[link])) - link.capsule.radius
         if lowest.min() < surface - base.z + _LEAST:
-            return "what lies around the hand"
+            return "the table or an object near the hand"
     own = [(np.array(it.start), np.array(it.end), it.radius) for it in _BASE]
     own.append((*placed[_UPPER_ARM], _UPPER_ARM.capsule.radius))
     for link in outer:
@@ -130,7 +132,7 @@ def collision(
         for link in (*outer, _ELBOW, _UPPER_ARM):
             apart = _distances(*placed[link], start, end) - link.capsule.radius - obstacle.radius
             if apart.min() < _LEAST:
-                return "something fixed"
+                return "a fixed body"
     return ""
 
 

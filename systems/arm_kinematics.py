@@ -140,15 +140,16 @@ def jacobian(q: NDArray[np.float64]) -> NDArray[np.float64]:
 def hand_state(q: list[float], v: list[float], base: ArmBase) -> list[float]:
     """Pose of the hand in the world, as x, y, z, yaw in m and rad, then the rates of these four.
 
-    If the hand does not point straight down, the yaw is that of the projection of its x axis. The
-    computation uses plain floats, which is faster for a call at every step.
+    If the hand does not point straight down, the yaw is the direction of its x axis as seen from
+    above. The computation uses plain floats, which is faster for a call at every step.
 
     Args:
         q: seven joint positions, in rad.
         v: seven joint velocities, in rad/s.
         base: pose of the arm's base in the world.
     """
-    # The hand's position p and x axis h with their rates, transformed from frame 7 to frame 1.
+    # Transform the hand's position p, its x axis h and their rates joint by joint, from frame 7 to
+    # frame 1.
     px = py = 0.0
     pz, hx, hy, hz = TIP_DISTANCE, _HAND_X[0], _HAND_X[1], 0.0
     dpx = dpy = dpz = dhx = dhy = dhz = 0.0
@@ -192,11 +193,11 @@ def planar(tip: NDArray[np.float64], q7: NDArray[np.float64]) -> NDArray[np.floa
     hand.
 
     Joints 3 and 5 are at zero. This is one of the solutions of `inverse`. It also exists when the
-    elbow is straight above the shoulder, where `inverse` is singular. On a straight line in joint
-    space between two such positions the hand points down all the way.
+    elbow is straight above the shoulder, where `inverse` is singular. All along a straight line in
+    joint space between two such positions, the hand points down.
 
     Args:
-        tip: (..., 3) the point midway between the fingertip ends, in B.
+        tip: (..., 3) the point midway between the fingertip ends, in B, in m.
         q7: (...) positions of joint 7, in rad.
 
     Returns:
@@ -222,14 +223,15 @@ def inverse(
     """All joint positions, in closed form, at which the hand points down and has a given pose.
 
     Args:
-        tip: (..., 3) the point midway between the fingertip ends, in B.
+        tip: (..., 3) the point midway between the fingertip ends, in B, in m.
         q7: (...) positions of joint 7, the free parameter, in rad.
         yaw: (...) yaws of the hand in B, in rad.
 
     Returns:
-        (..., 8, 7) joint positions in rad, one row for each of the 2 x 2 x 2 branches: two sides of
-        the line from shoulder to wrist for the elbow, two angles of joint 6, two of the shoulder. A
-        branch that does not exist is NaN. The joints' limits are not considered.
+        (..., 8, 7) joint positions in rad, one row for each of the 2 x 2 x 2 branches: the elbow on
+            either side of the line from shoulder to wrist, two angles of joint 6, and two angles of
+            the shoulder. A branch that does not exist is NaN. The joints' limits are not
+            considered.
     """
     rotation = np.zeros((*np.shape(q7), 3, 3))
     # The flange's x axis is the hand's, rotated back by the mounting angle. The flange's z axis
@@ -247,7 +249,7 @@ def inverse(
 def inverse_of_flange(
     rotation: NDArray[np.float64], origin: NDArray[np.float64], q7: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """All joint positions at which the flange has a given pose, which need not point down.
+    """All joint positions at which the flange has a given pose. The flange need not point down.
 
     Args:
         rotation: (..., 3, 3) rotations of the flange in B.
@@ -257,12 +259,12 @@ def inverse_of_flange(
     Returns:
         (..., 8, 7) joint positions by branch, as `inverse` returns them.
     """
-    # The axes of frame 7 before its rotation by q7, then the x and z axes of frame 6.
+    # x, y and z7 are the axes of frame 7.
     x, y, z7 = rotation[..., 0], rotation[..., 1], rotation[..., 2]
     c, s = np.cos(q7)[..., None], np.sin(q7)[..., None]
     x6, z6 = c * x - s * y, c * y + s * x
-    # Before its rotation by q7, frame 7 is frame 6 turned by pi/2 about x. So z6 is its y axis, and
-    # y6 its negative z axis.
+    # Rotated back by q7, frame 7 is frame 6 turned by pi/2 about x. So its y axis is z6 and its z
+    # axis -y6.
     y6 = -z7
     wrist = origin - _D_FLANGE * z7 - _A7 * x6
     shoulder = np.array([0.0, 0.0, _D1])
@@ -271,7 +273,7 @@ def inverse_of_flange(
     with np.errstate(invalid="ignore", divide="ignore"):
         toward = reach / distance
         at_wrist = np.arccos((distance**2 + _FORE**2 - _UPPER**2) / (2 * distance * _FORE))
-        # The line to the shoulder makes this angle with -z5, the axis of the forearm.
+        # `between` is the angle between the line to the shoulder and -z5, the axis of the forearm.
         between = math.atan2(_A4, _D5) + _ELBOW * at_wrist
         # Compute -z5, which lies in the plane of x6 and y6.
         along_x, along_y = np.sum(toward * x6, -1), np.sum(toward * y6, -1)
@@ -289,7 +291,8 @@ def inverse_of_flange(
 _ELBOW = np.array([1.0, 1.0, 1.0, 1.0, -1.0, -1.0, -1.0, -1.0])
 _WRIST = np.array([1.0, 1.0, -1.0, -1.0, 1.0, 1.0, -1.0, -1.0])
 _SHOULDER = np.array([1.0, -1.0] * 4)
-"""The sign of the shoulder's angle in each of the eight branches."""
+"""The signs of the elbow's side, of joint 6's angle and of the shoulder's angle in each of the
+eight branches."""
 
 
 def _angles(

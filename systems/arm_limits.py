@@ -18,7 +18,7 @@ def _all(value: float) -> _Seven:
 
 @dataclass(frozen=True)
 class VelocityEnvelope:
-    """Lower velocity limits near the ends of a joint's range.
+    """Velocity limits that fall towards the ends of a joint's range.
 
     A joint at q may move towards the end q_max no faster than
 

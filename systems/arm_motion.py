@@ -40,16 +40,17 @@ _JAW_ROOM = 0.005
 
 _TOUCH_SPEED = 0.011
 """Upper limit of `touch_speed` for an arm, in m/s. The force of an impact is proportional to mass
-times speed, and the mass that moves with an arm's hand is 10 to 25 kg, that of the floating hand
-4 kg."""
+times speed. The mass that moves with an arm's hand is 10 to 25 kg; with the floating hand it is 4
+kg."""
 
 
 class ArmState(PlannerState):
     """The planner's state, with the additional fields that an arm needs."""
 
     way = Array(WayVector.size)
-    """The `WayVector` of the present motion, which began at time `way_start`, in s."""
+    """The `WayVector` of the present motion."""
     way_start = Number()
+    """The time at which the present motion began, in s."""
     pick_joints = Array(JOINTS)
     """Joint positions above the pick, in rad. `place_joints` are those above the place."""
     place_joints = Array(JOINTS)
@@ -87,7 +88,7 @@ class ArmMotion(JawMotion):
             parameters: heights, speeds and forces of the motion primitive.
             limits: limits of the joints.
             base: pose of the arm's base in the world.
-            obstacles: fixed bodies that the arm must not touch, in the world.
+            obstacles: capsules around fixed bodies that the arm must not touch, in the world.
             highest_wait: upper limit of the height at which the hand waits, in m.
             inertia: model of the arm's inertia; if None, torque rates are not limited.
 
@@ -118,7 +119,7 @@ class ArmMotion(JawMotion):
         return vector
 
     def view(self, vector: NDArray[np.float64]) -> ArmState:
-        """Names the fields of a state vector, without a copy."""
+        """Returns a view of a state vector with named fields. See `RobotMotion`."""
         return ArmState(vector)
 
     def _make_way(self, vector: bytes) -> ArmWay:
@@ -147,11 +148,12 @@ class ArmMotion(JawMotion):
         return self._prepare(self.view(np.array(state.vector)))
 
     def prepare(self, state: PlannerState) -> bool:
-        """Chooses the joint positions at pick and place for the whole action."""
+        """Chooses the joint positions at pick and place. Returns whether the arm can do the
+        action."""
         return not self._prepare(self.view(state.vector))
 
     def _prepare(self, state: ArmState) -> str:
-        """Prepares an action. Returns the sentence of `reach_problem`."""
+        """Does the work of `prepare`. Returns the sentence of `reach_problem`."""
         now = self._way(state).at(math.inf)[:JOINTS]
         found, problem = self.postures.choose(self.stops(state), now)
         if problem:
@@ -272,7 +274,7 @@ class ArmMotion(JawMotion):
         way.line = goal
 
     def _set_retreat(self, state: ArmState, way: WayVector) -> None:
-        """Sets the motion up and back to the x of the home pose. Its y and yaw need not be
+        """Sets the motion up and back to the x of the home pose. The home's y and yaw need not be
         reached."""
         now = way.start[:JOINTS]
         y = float(self.postures.hand_pose(now)[1])
@@ -287,13 +289,14 @@ class ArmMotion(JawMotion):
     def waiting_joints(
         self, y: float, now: NDArray[np.float64], surface: float, z: float | None = None
     ) -> NDArray[np.float64]:
-        """(7) joint positions at the home's x, and at a y or as near to it as the arm can be.
+        """Returns (7) joint positions, in rad, at the x of the home pose and as near to a y as the
+        arm can be.
 
         Args:
-            y: in m.
-            now: (7) present joint positions.
+            y: wanted y of the hand in the world, in m.
+            now: (7) present joint positions, in rad.
             surface: height of the surface below, in m.
-            z: height of the fingertips in m; None: the one at which the hand waits.
+            z: height of the fingertips, in m; if None, the height at which the hand waits.
         """
         x, home_y, _, yaw = self._parameters.home
         z = self._wait_height if z is None else z
@@ -306,7 +309,7 @@ class ArmMotion(JawMotion):
         return self.home_joints
 
     def slow_down(self, state: PlannerState, time: float, share: float) -> None:
-        """Does nothing: the limits of the joints rule. See `RobotMotion`."""
+        """Does nothing: the limits of an arm's joints apply. See `RobotMotion`."""
 
     def back_off(self, state: PlannerState, distance: float) -> None:
         """Raises the goal of the present mode. See `RobotMotion`."""

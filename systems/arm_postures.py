@@ -25,17 +25,16 @@ from systems.arm_limits import JOINTS, ArmLimits
 MARGIN = 0.03
 """Least distance of a posture from the ends of the joints' ranges, in rad."""
 _SWIVELS = np.concatenate([sign * np.arange(0.1, 3.15, 0.1) for sign in (1.0, -1.0)])
-"""The swivels, defined in `ArmPostures`, that are tried if the vertical plane fails, in rad.
-"""
+"""The swivels, in rad, that are tried if the vertical plane fails. `ArmPostures` defines them."""
 _CHECKED = 12
 """Number of points of a path that are checked for collisions."""
 _JUMP = 1.5
-"""Largest change of a joint on a straight line up or down, in rad."""
+"""Largest allowed change of a joint on a straight line up or down, in rad."""
 _TILTS = (math.radians(2.0), math.radians(20.0), math.pi)
-"""Limits for the tilt of the hand on the way from one stop to the next, in rad: the least with
-which there is a way is used. One end of a long object would hang lower."""
+"""Limits of the hand's tilt between two stops, in rad. The smallest one that allows a motion is
+used, because one end of a long object hangs lower if the hand tilts."""
 _PLANAR = 1e-6
-"""If the swivel is smaller than this, in rad, the arm counts as in the vertical plane."""
+"""If the swivel is smaller than this, in rad, the arm counts as lying in the vertical plane."""
 
 
 @dataclass(frozen=True)
@@ -57,8 +56,8 @@ class ArmPostures:
     """Chooses among the joint positions that bring the hand to a pose.
 
     If possible, the arm lies in the vertical plane through its base and the hand. Otherwise its
-    wrist lies beside this plane. The *swivel* is the angle of the wrist to the plane, about the
-    hand's vertical axis.
+    wrist lies beside this plane. The *swivel* is the angle between the plane and the wrist, about
+    the hand's vertical axis.
     """
 
     def __init__(self, limits: ArmLimits, base: ArmBase, obstacles: Sequence[Capsule] = ()) -> None:
@@ -66,7 +65,7 @@ class ArmPostures:
         Args:
             limits: limits of the joints.
             base: pose of the arm's base in the world.
-            obstacles: fixed bodies that the arm must not touch, in the world.
+            obstacles: capsules around fixed bodies that the arm must not touch, in the world.
         """
         self.limits, self.base, self._obstacles = limits, base, tuple(obstacles)
         self._lower = np.array(limits.lower) + MARGIN
@@ -117,10 +116,10 @@ class ArmPostures:
     def choose(
         self, stops: Sequence[HandStop], now: NDArray[np.float64]
     ) -> tuple[list[NDArray[np.float64]], str]:
-        """Chooses postures at the high ends of one or more stops, so that the whole motion is
-        short, and the hand tilts as little as possible from one stop to the next.
+        """Chooses a posture at the high end of each stop, so that the whole motion is short and the
+        hand tilts as little as possible between two stops.
 
-        The jaws are symmetric: the yaws of all stops may be rotated by pi together.
+        The jaws are symmetric, so the yaws may be turned by pi, but only at all stops together.
 
         Args:
             stops: the stops, in the order in which the hand visits them.
@@ -172,7 +171,7 @@ class ArmPostures:
         best: list[NDArray[np.float64]] = []
         least = math.inf
         for half_turn in (0, 1):
-            # The fastest sequence of postures that ends at each option of a stop.
+            # Times and postures of the fastest ways that reach the options of the latest stop.
             ways = [(0.0, [now])]
             for found in options:
                 following = []
@@ -194,8 +193,8 @@ class ArmPostures:
         ways: list[tuple[float, list[NDArray[np.float64]]]],
         tilt: float,
     ) -> tuple[float, list[NDArray[np.float64]]] | None:
-        """The fastest way to a posture, with its time; None if each way would tilt the hand too far
-        while it may hold an object.
+        """Returns the time, in s, and the postures of the fastest way to a posture. Returns None if
+        each way would tilt the hand too far while it may hold an object.
 
         Args:
             q: (7) the posture.
@@ -249,8 +248,8 @@ class ArmPostures:
     def _ways(
         self, stop: HandStop, yaw: float, swivels: NDArray[np.float64]
     ) -> list[NDArray[np.float64]]:
-        """For each posture, (k, 7) joint positions at k heights from the low to the high end.
-        Heights out of reach are NaN."""
+        """Returns an array for each posture: (k, 7) joint positions at k heights from the low to
+        the high end. Heights out of reach are NaN."""
         heights = np.linspace(stop.low, stop.high, 5)
         poses = np.array([[stop.x, stop.y, z, yaw] for z in heights])
         x, y, z, yaws = np.moveaxis(self.base.to_base(poses), -1, 0)
@@ -283,7 +282,7 @@ class ArmPostures:
         if found and all(touched):
             return f"for {where} the arm would collide with {touched[0]}"
         if found:
-            return f"{where} is where the arm cannot lower its hand straight"
+            return f"the arm cannot lower its hand in a straight line to {where}"
         # The yaw affects joint 7 only.
         if reached(*np.linspace(0.0, math.pi, 5)[:-1].tolist()):
             return f"{where} would take joint 7 out of its range"

@@ -13,8 +13,8 @@ from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import PlanarPose
 
 _ROOM_ABOVE = 0.03
-"""How far above the clear height the arm must also reach, in m: motions with rounded corners rise
-above it."""
+"""How far above the clear height the arm must be able to rise, in m. Motions with rounded corners
+rise above the clear height."""
 
 
 def hand_stops(
@@ -55,8 +55,8 @@ def reach_problem(
 
     Args:
         postures: chooses the arm's postures.
-        stops: the stops of `hand_stops`. If the jaws are turned by half a turn at one stop, they
-            are turned at all.
+        stops: the stops of `hand_stops`. The jaws may be turned by half a turn, but only at all
+            stops together.
         now: (7) present joint positions, in rad; if None, the middles of the joints' ranges.
     """
     if now is None:

@@ -1,5 +1,4 @@
-"""Maps where the hand of a Franka arm can be while it points down. Only the joints' ranges
-count."""
+"""Maps where a Franka arm can bring its hand, pointing down, within the ranges of its joints."""
 
 from __future__ import annotations
 
@@ -25,7 +24,7 @@ _CHUNK = 256
 
 
 class ReachMap:
-    """The reach of an arm at some heights, for any base.
+    """The reach of an arm at given heights, for any pose of its base.
 
     Joints 2 to 6 depend only on the hand's distance from the base's axis, its height, and the
     swivel. The azimuth of the hand adds to joint 1, and its yaw to joint 7. So the postures are
@@ -65,7 +64,7 @@ class ReachMap:
         return np.asarray(inside[..., 1:6].all(-1)), found[..., 0]
 
     def shares(self, base: ArmBase, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(n, m) for each point and height, the share of all yaws at which the hand can be there.
+        """Returns (n, m) the share of all yaws at which the hand can be at each point and height.
 
         Args:
             base: pose of the arm's base in the world; its height is not used.

@@ -88,8 +88,8 @@ class ArmStop:
         self.goal = self._states[-1, 0].copy()
 
     def at(self, time: float) -> NDArray[np.float64]:
-        """(21) joint positions, velocities and accelerations at a time since the beginning, in s,
-        which must be before the end."""
+        """Returns (21) joint positions, velocities and accelerations, in rad and s. The time, in s
+        since the beginning, must be before the end."""
         index = min(max(bisect.bisect_right(self._times, time) - 1, 0), len(self._times) - 2)
         h, lasts = time - self._times[index], self._times[index + 1] - self._times[index]
         q, v, a = self._states[index]
@@ -121,5 +121,5 @@ def _calculate(
     trajectory = ruckig.Trajectory(JOINTS)
     result = ruckig.Ruckig(JOINTS).calculate(given, trajectory)
     if result not in (ruckig.Result.Working, ruckig.Result.Finished):
-        raise RuntimeError(f"no stop of the arm was found: {result}")
+        raise RuntimeError(f"Ruckig found no motion that stops the arm: {result}")
     return trajectory

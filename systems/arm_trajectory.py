@@ -96,7 +96,8 @@ class ArmTrajectory:
         return quintic(q, v, a, step=1 / self.rate, since=time - index / self.rate)
 
     def width_at(self, time: float) -> tuple[float, float]:
-        """The opening of the jaws in m, if they hold nothing, and its rate in m/s."""
+        """Returns the opening of the jaws, in m, and its rate, in m/s. The jaws are assumed to be
+        empty."""
         width, rate, since = self.start_width, 0.0, 0.0
         goal, speed = width, 0.0
         for command in (*self.jaws, None):
@@ -135,8 +136,8 @@ def quintic(
         step: time between the points, in s.
         since: time since the first point at which to evaluate, in s.
     """
-    # Subtract the parabola of the first point; the rest is a polynomial in since / step with powers
-    # 3 to 5.
+    # Subtract the parabola that continues the motion at the first point. The rest is a polynomial
+    # in since / step with powers 3 to 5.
     h = step
     first = q[1] - q[0] - h * v[0] - h * h / 2 * a[0]
     second = h * (v[1] - v[0] - h * a[0])
@@ -165,17 +166,18 @@ def plan_action(
 ) -> ArmTrajectory | str:
     """Plans the joint trajectory of an action, as the planner would execute it.
 
-    Contacts are not known in advance. So the arm descends to the grasp height, the jaws get the
-    time to close and to open fully, and the held object is lowered to the surface that o_t shows at
-    its place. But the fingertips stay above the rim of a cavity, so the object may drop into it.
+    Contacts are not known in advance. So the arm descends to the grasp height, and the jaws get the
+    time to close and to open fully. The held object is lowered to the surface that o_t shows at its
+    place, but the fingertips stay above the rim of a cavity, where the object may drop the rest of
+    the way.
 
     Args:
         motion: plans the arm's motions.
         parameters: the parameters of `motion`.
         action: a pick and place, or a press.
         surfaces: heights of the surfaces around pick and place.
-        joints: (7) joint positions at which the arm starts, at rest, in rad; `motion.home_joints`
-            if None.
+        joints: (7) joint positions at which the arm starts, at rest, in rad; if None,
+            `motion.home_joints`.
         rate: rate of the points, in Hz, from `SLOWEST_RATE` to `FASTEST_RATE`.
 
     Returns:

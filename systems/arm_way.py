@@ -24,11 +24,12 @@ _SPACING = 0.010
 """Spacing of a path's points, in s: the time that the slowest joint takes from one to the next at
 full speed."""
 _ROUNDING, _WIDER = 0.15, 0.3
-"""Length of the path over which corners are rounded, in the same measure as `_SPACING`: if the path
-has two corners, and if it has one."""
+"""Lengths of path over which corners are rounded, as times like `_SPACING`: for a path with two
+corners, and for a path with one."""
 _FEWEST, _MOST = 40, 200
 _TRIES, _PATIENCE = 8, 3
-"""How often a path that crosses too low is raised at most, and after how many tries by more."""
+"""A path that crosses too low is raised at most `_TRIES` times; after `_PATIENCE` tries, by more
+each time."""
 _ANY_ACCELERATION = 1e3
 """Acceleration of the yaw on a straight line, in rad/s^2. It is so large that only the joints'
 limits matter."""
@@ -56,8 +57,8 @@ class WayVector(VectorView):
     line = Array(4)
     """Goal of a straight line of the hand: x, y, z, yaw in the world."""
     marks = Array(2)
-    """Two heights: below the first the hand slows down on the line, below the second it slows down
-    again."""
+    """Two heights on the line. The hand slows down below the first, and once more below the
+    second."""
     speeds = Array(3)
     """Speeds of the line: above, between and below the marks."""
     yaw_speed = Number()
@@ -70,7 +71,7 @@ class WayVector(VectorView):
     sink = Number()
     """Height to which the hand sinks at the end of a path that crosses."""
     reach = Number()
-    """How far a held object reaches to the side of the fingertips, where it hangs lower if the hand
+    """How far a held object reaches to the side of the fingertips. Its end hangs lower if the hand
     tilts."""
     speed = Number()
     """Highest linear speed of the hand on a path that crosses. `acceleration` is the highest linear
@@ -98,7 +99,7 @@ class ArmWay:
     ) -> None:
         """
         Args:
-            vector: a `WayVector`.
+            vector: the elements of a `WayVector`.
             postures: chooses the arm's postures.
             inertia: model of the arm's inertia; if None, torque rates are not limited.
         """
@@ -201,7 +202,8 @@ class ArmWay:
         poses = np.array([self._postures.hand_pose(point) for point in path.points])
         yaw = np.unwrap(poses[:, 3])
         fast, middle, slow = way.speeds.tolist()
-        # The speed at a point is that of its lower neighbour.
+        # The speed limit at a point depends on the lower one of its height and the next point's
+        # height.
         below = np.minimum(poses[:, 2], np.append(poses[1:, 2], poses[-1, 2]))
         limit = np.where(below < way.marks[1], slow, np.where(below < way.marks[0], middle, fast))
         high = np.column_stack([np.repeat(limit[:, None], 3, 1), np.full(len(yaw), way.yaw_speed)])
@@ -227,10 +229,11 @@ class ArmWay:
             missing = self._missing(path, float(way.clear), float(way.reach))
             if missing <= 0.001:
                 return path
-            # Near a rounded corner a little more height may not help, so raise it ever more.
+            # Near a rounded corner a little more height may not help, so raise by more with each
+            # try.
             raised += (missing + 0.005) * 2 ** max(attempt - _PATIENCE, 0)
         if path is None:
-            # The path has no length, so stay.
+            # The path has no length, so the arm stays where it is.
             points = np.repeat(q[None], 3, axis=0)
             return _Path(points, self._postures.base.to_world(fingertips(points)))
         return path
@@ -252,8 +255,8 @@ class ArmWay:
         return below if len(below) > 1 else above[-1:]
 
     def _missing(self, path: _Path, clear: float, reach: float) -> float:
-        """How far hand and object sink below the clear height between start and end, in m; not
-        positive if they stay above."""
+        """How far, in m, the hand or its object sinks below the clear height between start and end;
+        not positive if both stay above."""
         tips, low = path.tips, path.tips[:, 2]
         if path.points[:, [2, 4]].any():
             low = low - _reach_below(path.points, reach)
@@ -279,12 +282,12 @@ class ArmWay:
 
 
 def _reach_below(q: NDArray[np.float64], reach: float) -> NDArray[np.float64]:
-    """(n) how far the tilted hand and its object reach below the point between the fingertips, in
-    m.
+    """(n) how far, in m, the tilted hand or its object reaches below the point between the
+    fingertips.
 
     Args:
-        q: (n, 7) joint positions.
-        reach: of the object to the side, in m; NaN if the hand is empty.
+        q: (n, 7) joint positions, in rad.
+        reach: how far the object reaches to the side, in m; NaN if the hand is empty.
     """
     down = uprightness(q)
     across = np.sqrt(1 - np.minimum(down, 1.0) ** 2)

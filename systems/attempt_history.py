@@ -14,14 +14,14 @@ MOST_ATTEMPTS = 64
 MOST_FAILED = 16
 """Number of failed picks that are remembered."""
 _SAME_OBJECT = 0.040
-"""If a measured centre of mass and a pick are closer than this, they are taken for the same
-object's, in metres."""
+"""A measured centre of mass closer than this to a pick, in metres, counts as that of the picked
+object."""
 MOST_LEFT_OVER = 24
-"""At most this many objects, and as many cavities, of a `LeftOver` are kept."""
+"""At most this many objects, and as many cavities, of a `LeftOver` are stored."""
 
 
 class _Row(VectorView):
-    """The vector's part that holds one attempt; all NaN if it is unused."""
+    """The part of the vector that holds one attempt; all NaN if it is unused."""
 
     pick = Array(3)
     """Pick pose in the world: x and y in m, theta in rad."""
@@ -92,8 +92,8 @@ class AttemptHistory:
         return tuple(failed[-MOST_FAILED:])
 
     def set_downs(self, pick: PlanarPose) -> int:
-        """How many attempts have measured a centre of mass near a pick, and so set an object down
-        again."""
+        """How many attempts measured an object's centre of mass near a pick. Each of them set the
+        object down again."""
         felt = self._rows[: self._count(), -2:]
         away = np.linalg.norm(felt - (pick.x, pick.y), axis=1)
         return int(np.count_nonzero(away < _SAME_OBJECT))
@@ -103,11 +103,11 @@ class AttemptHistory:
 
 
 class LeftOverVector:
-    """Keeps a `LeftOver`, or None, in a vector that the caller owns."""
+    """Stores a `LeftOver`, or None, in a vector that the caller owns."""
 
     size = 1 + 4 * MOST_LEFT_OVER
-    """Number of elements of the vector: first 1 if there is a `LeftOver`, else 0; then x and y of
-    each object and of each cavity, and NaN for unused elements."""
+    """Number of elements of the vector. The first is 1 if there is a `LeftOver`, else 0. Then
+    follow x and y of each object and of each cavity; unused elements are NaN."""
 
     def __init__(self, vector: NDArray[np.float64]) -> None:
         """

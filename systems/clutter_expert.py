@@ -22,7 +22,8 @@ _NEAR_BEST = 0.035
 """A grasp further than this from the object's best grasp, in metres, is used only to lay the object
 aside."""
 _ANY = math.radians(65.0)
-"""Largest tilt of a gripped face when all flatter grasps have failed, in radians."""
+"""Largest tilt of the gripped faces from the vertical, in radians, for an object without better
+grasps."""
 _IN_CAVITY = 0.03
 """An object displaced less than this from its goal, in metres, lies in or over its cavity."""
 
@@ -75,7 +76,7 @@ class ClutterExpert:
         return None
 
     def aside(self, items: Sequence[int]) -> PickPlaceAction | None:
-        """The action that lays one of some objects aside; None if none can be.
+        """The action that lays one of the given objects aside; None if none can be laid aside.
 
         It prefers objects with nothing on top of them, then the least obstructed grasp, then the
         highest object.
@@ -114,7 +115,7 @@ class ClutterExpert:
         return moved_gripper(hold.gripper, middle(self._points[index], yaw), yaw, goal)
 
     def _may_let_go(self, index: int, grasp: Grasp, place: PlanarPose, rim: float) -> bool:
-        """Whether no other object is under the hand as it opens."""
+        """Whether no other object is in the way of the jaws as they open."""
         halves = (grasp.width / 2, grasp.width / 2 + self._table.planner.release_clearance)
         return not any(
             in_the_way(points, place, rim + 0.003, halves)

@@ -1,4 +1,4 @@
-"""Finds, from true poses, which objects lie on others and which grasps are free."""
+"""Finds, from true poses, which objects lie on others and which grasps nothing obstructs."""
 
 from __future__ import annotations
 
@@ -36,24 +36,24 @@ far below the other's highest point."""
 _LEAST_SQUARES = 2
 """An object lies on another if it is above it in at least this many squares."""
 _FLAT = math.radians(2.5)
-"""An object tilted by less than this lies flat, in radians."""
+"""An object tilted by less than this, in radians, lies flat."""
 _SAME_SHAPE = 0.0003
 """Two surfaces count as equal if the mean distance between their points exceeds the points' spacing
 by less than this, in metres."""
 _ROLLED = math.radians(20.0)
-"""A tilt below this is not caused by rolling, in radians."""
+"""A tilt below this, in radians, does not count as caused by rolling."""
 _ROLLED_PITCH = math.radians(10.0)
-"""The axis of a round object deviates by less than this from the x axis of its frame B, in
-radians."""
+"""The axis of a round object deviates by less than this, in radians, from the x axis of its frame
+B."""
 _UPSIDE_DOWN = math.radians(120.0)
-"""An object tilted by more than this lies upside down, in radians."""
+"""An object tilted by more than this, in radians, lies upside down."""
 _ON_EDGE = math.radians(60.0)
-"""An object tilted by more than this, but not upside down, stands on its edge, in radians."""
+"""An object tilted by more than this, in radians, stands on its edge unless it lies upside down."""
 _ALONG_EDGE = (0.0, 0.02, -0.02, 0.04, -0.04)
 """Where an object that stands on its edge is gripped: distances from its centre along its length,
 in metres."""
 _STEEPEST = math.radians(25.0)
-"""The jaws cannot hold faces that are tilted by more than this from the vertical, in radians."""
+"""The jaws cannot hold faces that are tilted by more than this, in radians, from the vertical."""
 _SLENDER = 0.020
 """Height of a finger's slender tip, in metres."""
 _PALM_ROOM = PALM_HEIGHT - 0.003
@@ -61,7 +61,8 @@ _PALM_ROOM = PALM_HEIGHT - 0.003
 _MARGIN = 0.001
 """Least clearance between a finger and other objects, in metres."""
 _SAME_PLACE, _SAME_ANGLE = 0.006, math.radians(15.0)
-"""A grasp closer than this to one that failed counts as the same, in metres and radians."""
+"""A grasp that differs from a failed one by less than this, in metres and radians, counts as the
+same."""
 
 
 @dataclass(frozen=True)
@@ -139,8 +140,8 @@ class ClutteredTable:
         None.
 
         The object lies flat and the right way up, or has a shape that looks the same after it
-        rolled, such as a round handle. In that case the heading is the one at which the shape looks
-        the same.
+        rolled, such as a round handle. The heading of a rolled object is the one at which its shape
+        looks the same.
         """
         yaw = heading(X_WB)
         if tilt(X_WB) < _FLAT:
@@ -175,10 +176,10 @@ class ClutteredTable:
             poses: X_WB of each object.
             points: the surface points of each object in the world.
             failed: gripper poses, in the world, of earlier picks that held nothing.
-            ignores_fixtures: whether fixtures do not count as obstructions. For an object in a
-                cavity they must not.
-            steepest: grasps on faces tilted by more than this from the vertical are left out, in
-                radians.
+            ignores_fixtures: whether fixtures do not count as obstructions. Set it for an object
+                that lies in a cavity.
+            steepest: grasps on faces that are tilted by more than this, in radians, from the
+                vertical are left out.
         """
         around = [item for other, item in enumerate(points) if other != index]
         if not ignores_fixtures:

@@ -1,4 +1,4 @@
-"""Watches the contact force on the hand: weighs the payload, keeps peaks, and enforces a limit."""
+"""Watches the contact force on the hand: weighs the payload, records peaks, enforces a limit."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ _AT_REST = (Mode.OBSERVE, Mode.DONE)
 
 
 def known_payload(state: PlannerState) -> float:
-    """The vertical force of the held object on the hand, in N, negative downwards: as it is felt,
-    and as soon as it has been weighed, its weight. It is zero in other modes than `LIFT`, `CARRY`,
-    `LOWER` and `SEARCH`."""
+    """The vertical force of the held object on the hand, in N, negative downwards. It is the
+    measured force until the object has been weighed, then the object's weight. It is zero in other
+    modes than `LIFT`, `CARRY`, `LOWER` and `SEARCH`."""
     mode = Mode(int(state.mode))
     if mode in (Mode.LOWER, Mode.SEARCH):
         return state.payload
@@ -51,10 +51,10 @@ class ContactGuard:
 
     - m is zero while the hand is empty.
     - In `LIFT`, and in `CARRY` until the object is weighed, m is the mass that makes the vertical
-      force zero, but between 0 and `HEAVIEST`.
+      force zero, limited to the range from 0 to `HEAVIEST`.
     - In `CARRY`, while the hand is above the travel height, the object is weighed: m is the mean of
       -f_z / (g + a_z). A contact further down therefore does not count as payload.
-    - In `RELEASE` and `RETREAT` the object may still hang in the jaws or not, so any f_z between
+    - In `RELEASE` and `RETREAT` the jaws may or may not still hold the object, so any f_z between
       its weight and zero counts as no contact.
 
     The guard acts if the vertical or the lateral force exceeds the limit. In `APPROACH` and
@@ -132,8 +132,8 @@ class ContactGuard:
         return must_stop
 
     def tare(self, state: PlannerState, contact: NDArray[np.float64], threshold: float) -> None:
-        """Sets the payload to the vertical force at rest, unless that differs too much from the
-        weighed payload: then something else touches the hand or the object.
+        """Sets the payload to the vertical force at rest. If this force differs too much from the
+        weighed payload, something else touches the hand or the object, and the payload stays.
 
         Args:
             state: the planner's state, at the end of `CARRY`.

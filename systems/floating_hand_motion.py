@@ -56,11 +56,12 @@ class HandMotion(JawMotion):
         return vector
 
     def view(self, vector: NDArray[np.float64]) -> PlannerState:
-        """Names the fields of a state vector, without a copy."""
+        """Returns a view of a state vector with named fields. See `RobotMotion`."""
         return PlannerState(vector)
 
     def prepare(self, state: PlannerState) -> bool:
-        """Chooses, among equivalent yaws at pick and place, those that rotate the wrist least."""
+        """Chooses, among equivalent yaws at pick and place, those that rotate the wrist least.
+        Returns True, because the hand can do every action."""
         state.pick[2], state.place[2] = shortest_yaws(
             float(state.pick[2]), float(state.place[2]), float(state.goal[YAW]), YAW_LIMIT
         )
@@ -99,7 +100,8 @@ class HandMotion(JawMotion):
         self.set_times(state)
 
     def _set_goals(self, state: PlannerState, mode: Mode) -> None:
-        """Sets the goals of a mode, unless the hand only brakes to rest."""
+        """Sets the goal of a mode. In the modes that are not named here, the hand brakes to
+        rest."""
         parameters = self._parameters
         if mode == Mode.APPROACH:
             state.goal = (*state.pick[:2], state.pick_hover_z, state.pick[2])

@@ -18,7 +18,7 @@ _YAWS = 8
 _LEAST = 0.010
 """Least clearance around the object, in metres."""
 _AMPLE = 0.060
-"""Clearance beyond this has no benefit, because the open hand already has room, in metres."""
+"""Clearance beyond this, in metres, has no benefit: the open hand already has room."""
 _WAY = 0.02
 """A position one metre farther away must have this much more clearance to be preferred, in
 metres."""

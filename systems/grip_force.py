@@ -1,4 +1,4 @@
-"""The force of the pads, chosen by the weight and the moment that the hand feels."""
+"""Computes the force of the pads, and how gently to move, from an object's weight and moment."""
 
 import numpy as np
 
@@ -13,10 +13,10 @@ the force has risen."""
 _EASY_MOMENT = 0.18
 """A moment about the axis of the pads that friction holds easily, in N m."""
 _MOMENT_ARM = 0.0030
-"""The pads hold a moment of their force times this length, in m, while the hand accelerates. A long
-round handle begins to turn at 5 mm."""
+"""While the hand accelerates, the pads hold a moment up to their force times this length, in m. A
+long round handle begins to turn at a length of 5 mm."""
 _HELD_MOMENT = 0.30
-"""A moment that a firm grip holds on the way if it holds it at rest, in N m."""
+"""Largest moment, in N m, that the pads hold in motion if they hold it at rest."""
 _NOTABLE_MOMENT = 0.10
 """A moment that a poor grip might not hold, in N m."""
 _INDULGENCE = 0.5
@@ -29,7 +29,8 @@ press less."""
 _MUCH_LESS = 0.85
 """The force on an object into which the jaws sink falls only in steps of at least this factor."""
 _GENTLE, _GENTLEST = 0.5, 0.25
-"""Shares of the acceleration limits for an object that may turn, and the least of all."""
+"""Shares of the acceleration limits: for an object that may turn, and the least one for any
+object."""
 _GENTLER = 0.8
 """A motion is restarted when its acceleration should be less than this share of the present one."""
 _LEAST_CHANGE = 1.05
@@ -97,7 +98,7 @@ def soft_force(
     soft = min(_SOFT, _SOFT_SHARE * width)
     most = max(peak * (soft / max(sunk, soft)) ** 2, parameters.grasp_force)
     if most > _MUCH_LESS * present:
-        # Keep it, so that its ramp is not restarted.
+        # Keep the present force, so that its ramp is not restarted.
         most = max(most, present)
     return min(force, most)
 
@@ -126,8 +127,8 @@ def gentleness(
 def moment_at_rest(moment: float, acceleration: float) -> float:
     """The moment about the axis of the pads that the object would exert at rest, in N m.
 
-    An upward acceleration increases the felt moment, and is corrected for. While the hand brakes,
-    it lags behind its command, so no correction is made.
+    The effect of an upward acceleration is removed. No correction is made while the hand brakes,
+    because it then lags behind its command.
 
     Args:
         moment: the moment felt at the wrist, in N m.
@@ -141,7 +142,7 @@ def felt_lever(moment: float, weight: float) -> float:
     axis, in m.
 
     The estimate also holds while one end of the object rests on the table, because moment and
-    weight are then reduced together.
+    weight are then reduced in proportion.
 
     Args:
         moment: moment about the axis of the pads while the hand rests, in N m.
@@ -160,7 +161,7 @@ def may_turn(moment: float) -> bool:
 
 
 def turns_in_the_pads(moment: float, times: float) -> bool:
-    """Whether an object may turn between the pads, so that it must be seen how it hangs.
+    """Whether an object may turn between the pads, so that the planner must check how it hangs.
 
     Args:
         moment: moment about the axis of the pads while the hand rests, in N m.
@@ -171,7 +172,7 @@ def turns_in_the_pads(moment: float, times: float) -> bool:
 
 
 def slips_when_carried(moment: float, times: float) -> bool:
-    """Whether an object that hangs still may turn between the pads on the way.
+    """Whether an object that does not turn between the pads at rest may turn when it is carried.
 
     The arguments are those of `turns_in_the_pads`.
     """

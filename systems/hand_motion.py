@@ -49,8 +49,9 @@ def blended_legs(
     """Computes legs with different speeds along one line, without stops between them.
 
     Each leg begins when the one before begins to brake. The sum of the two motions then changes
-    smoothly from one speed to the other. A leg is shortened so that it has stopped at the point
-    where it should end; if it is too short for that, the next leg covers its distance as well.
+    smoothly from one speed to the other. A leg is shortened by the distance that the next leg
+    covers during this time, so that both together end where they should. If nothing is left of a
+    leg, the next leg covers its whole distance.
 
     Args:
         ways: the lengths of the legs, in order, in m; all of one sign, or zero.

@@ -16,11 +16,11 @@ from systems.signals import Observation, PixelGrid
 from systems.table_plane import level
 
 _DEEPEST = 0.05
-"""Points more than this below `grid.z_min` are ignored, in metres."""
+"""Points more than this below `grid.z_min`, in metres, are ignored."""
 _ROUNDING = 1e-5
 """Upper limit of the rounding error of a height, in metres."""
 SAME_SURFACE = 0.01
-"""Heights that differ by less than this belong to one surface, in metres."""
+"""Heights that differ by less than this, in metres, belong to one surface."""
 
 
 class DepthRays(NamedTuple):
@@ -92,8 +92,8 @@ def project(
     Args:
         views: one for each camera, at least one.
         grid: the pixels of the heightmap.
-        region: (rows, cols) mask of the pixels to compute; None for all. The others count as out of
-            view.
+        region: (rows, cols) mask of the pixels to compute; None for all. Pixels outside the mask
+            count as out of view.
     """
     in_view = np.any([looks_at(view, grid) for view in views], axis=0)
     image, valid = _fuse(np.stack([_see(view, grid) for view in views]))
@@ -192,8 +192,8 @@ def _see(view: View, grid: PixelGrid) -> NDArray[np.float32]:
 
 
 def _sortable(values: NDArray[np.float32]) -> NDArray[np.int32]:
-    """Maps float32 numbers to integers of the same order, bit by bit. Applied to its result, it
-    returns the numbers' bits."""
+    """Maps float32 numbers to integers of the same order, bit by bit. Applied to its own result,
+    the function returns the bits of the numbers."""
     bits = values.view(np.int32)
     return np.where(bits < 0, bits ^ np.int32(0x7FFFFFFF), bits)
 

@@ -1,4 +1,4 @@
-"""Force-guided search for a cavity when the lowered object stands on its rim."""
+"""Force-guided search for a cavity, for a lowered object that stands on the cavity's rim."""
 
 import math
 from dataclasses import dataclass

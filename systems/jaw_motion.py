@@ -11,7 +11,7 @@ class JawMotion:
     """Computes jaw openings and closing forces in all modes from the planner's state."""
 
     settles = math.inf
-    """See `RobotMotion`; infinite, because the parameter `tare_settle` sets this time."""
+    """Infinite, because the parameter `tare_settle` sets this time. See `RobotMotion`."""
 
     def __init__(self, parameters: PickPlaceParameters) -> None:
         """
@@ -65,7 +65,7 @@ class JawMotion:
             state.goal_force, state.force_start_time = force, time
 
     def opening_at(self, state: PlannerState, time: float) -> tuple[float, float]:
-        """The opening between the pads in m, and its rate in m/s."""
+        """Returns the opening between the pads at a time, in m, and its rate, in m/s."""
         return ramp(
             state.start_opening,
             state.goal_opening,
@@ -82,7 +82,7 @@ class JawMotion:
         return float(state.start_force + fraction * (state.goal_force - state.start_force))
 
     def jaws_arrival(self, state: PlannerState, moved: float) -> float:
-        """The time, in s, at which the jaws' motion and force of the present mode are complete, or
+        """The time, in s, at which the present mode's motion and force of the jaws are complete, or
         `moved` if that is later."""
         opening_time = abs(state.goal_opening - state.start_opening) / (
             2 * self._parameters.finger_speed

@@ -26,15 +26,15 @@ def object_width(
     in which the jaws close.
 
     Args:
-        height: (rows, cols) above the bottom of the grid, in m.
+        height: (rows, cols) heights above the bottom of the grid, in m.
         grid: pixel grid of the heights.
         pick: pose of the hand in the world; the jaws close along its y axis.
         support: height of the surface on which the object stands, in m.
         top: height of the object's top at the pick, in m.
 
     Returns:
-        The width in m. Infinite if the object is not seen at the pick, is wider than open jaws, or
-        if something stands where half-open fingers would go down.
+        The width in m. It is infinite if the object is not seen at the pick, is wider than open
+            jaws, or if something stands where half-open fingers would go down.
     """
     level = support + _LEVEL * (top - support)
     farthest = MAX_OPENING / 2 + FINGERTIP_DEPTH
@@ -51,7 +51,7 @@ def object_width(
     if not high[0] or high.all():
         return math.inf
     side = int(np.argmin(high))
-    # The area in which the fingers stand beside the object.
+    # The fingers stand beside the object, up to this distance from the pick.
     reach = half[side] + _ROOM + FINGERTIP_DEPTH
     if reach > farthest or high[side:][half[side:] < reach].any():
         return math.inf

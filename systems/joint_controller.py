@@ -21,7 +21,7 @@ from systems.trajectory_controller import FINGERS, FingerLaw
 _FOLLOWS = 0.05
 """Time constant with which the compensated load f follows the port `payload`, in s."""
 _EQUAL = 1e-3
-"""Loads that differ by less than this count as equal, in N."""
+"""Loads that differ by less than this, in N, count as equal."""
 
 
 class JointController(LeafSystem):

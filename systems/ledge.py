@@ -51,9 +51,9 @@ class Ledge:
         Args:
             outline: (k, 2) points of the held object relative to its centre of mass, first along
                 its heading and then to the left of it, in metres.
-            p_WCenter: the object's centre of mass in the world, in metres. It determines the edge
-                and the share outside, so that after a failure, when the object lies elsewhere,
-                another try differs.
+            p_WCenter: the object's centre of mass in the world, in metres. The edge and the share
+                outside depend on it: after a failure the object lies elsewhere, and the next try
+                differs.
             others: (m, 3) points of everything that may be in the way, in the world.
             area: lower and upper (x, y) corners of the area in which the object may land.
             inner_side: the side of the object that rests on the block: 1 for the left one, -1 for
@@ -92,7 +92,7 @@ class Ledge:
                 delta = others[:, :2] - edge
                 u, v = delta @ along, delta @ normal
                 count = int(((np.abs(u) < length / 2 + _ROOM) & (v > -0.05) & (v < _LANDING)).sum())
-                # The object lies beside this edge, so it was probably released here before.
+                # If the object lies beside this edge, it was probably released here before.
                 again = bool(np.linalg.norm(p_WCenter[:2] - edge) < _LANDING)
                 if best is None or (count, again) < best[0]:
                     p_W = edge + outside * normal
@@ -102,8 +102,8 @@ class Ledge:
 
 
 def _inside(outline: NDArray[np.float64]) -> float:
-    """How far an object reaches to the left of its centre of mass, in metres: the smaller of the
-    values before and behind it."""
+    """How far an object reaches to the left of its centre of mass, in metres: the smaller one of
+    its reaches before and behind the centre of mass."""
     u, v = outline.T
     reach = u.max() - u.min()
     sides = [(sign * u > _BESIDE) & (sign * u < 0.3 * reach) for sign in (-1, 1)]

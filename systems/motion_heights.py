@@ -1,4 +1,4 @@
-"""Fingertip heights of one pick and place, from the surface heights in o_t."""
+"""Computes the fingertip heights of one pick and place from the surface heights in o_t."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from systems.pick_place_parameters import Mode
 _FREE_MODES = (Mode.RETREAT, Mode.OBSERVE)
 """The modes in which the hand is empty."""
 _STILL_THERE = 1.0
-"""An object within this distance of its waiting position is still waiting, in metres."""
+"""An object within this distance, in metres, of its waiting position is still waiting."""
 
 
 class ObjectFeeder(LeafSystem):

@@ -33,9 +33,9 @@ from systems.signals import PickPlaceAction, PlanarPose, SurfaceHeights, wrap_to
 from systems.weak_calc import weak_calc
 
 _NEAR_GOAL = 0.03
-"""An object within this distance of a goal's pose counts as near it, in metres."""
+"""An object within this distance of a goal's pose, in metres, counts as near it."""
 _SAME_HEIGHT = 0.005
-"""Objects within this height difference are equally high, in metres."""
+"""Objects whose heights differ by less than this, in metres, count as equally high."""
 
 
 def gripper_pose(
@@ -46,8 +46,7 @@ def gripper_pose(
     Args:
         X_WB: the object's pose.
         grasp: the grasp in the object's frame B.
-        height: z in B, in metres, of the point of a tilted object whose (x, y) in the world the
-            gripper takes.
+        height: z of the gripped point in B, in metres. It matters only if the object is tilted.
     """
     yaw = heading(X_WB)
     x, y, _ = X_WB @ np.array([grasp.x, grasp.y, height])
@@ -57,7 +56,7 @@ def gripper_pose(
 def grasp_taken(X_WB: RigidTransform, gripper: PlanarPose) -> PlanarPose:
     """The grasp by which a gripper pose in the world holds an object that lies flat at X_WB.
 
-    The inverse of `gripper_pose`.
+    This is the inverse of `gripper_pose`.
     """
     yaw = heading(X_WB)
     dx, dy = np.array([gripper.x, gripper.y]) - X_WB.translation()[:2]
@@ -118,7 +117,7 @@ class OraclePolicy(LeafSystem):
 
     If objects may touch or lie on each other (`table` is given), `ClutterExpert` chooses the object
     and the grasp, and lays aside objects that are in the way. Its actions are not rounded, and
-    carry heights.
+    carry surface heights.
 
     State: the number of attempts by object and grasp.
     """

@@ -79,7 +79,7 @@ def fastest_times(
 
 
 def _solvable(b: NDArray[np.float64], k: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(n) the largest x for which some u satisfies all rows."""
+    """(n) the largest x for which some u satisfies the limits of all rows."""
     gap = k[:, :, None] - k[:, None, :]
     room = b[:, :, None] + b[:, None, :]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -91,7 +91,7 @@ def _largest(
     highest: list[float], b: NDArray[np.float64], k: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """(n) the largest x = (ds/dt)^2 at each point, from one pass backwards and one forwards."""
-    # Before a point with x at most e, x (1 - 2 k) must be at most e + 2 b in each row.
+    # If x is at most e at the next point, x (1 - 2 k) must be at most e + 2 b in each row.
     with np.errstate(divide="ignore"):
         gain = np.where(1 - 2 * k > 0, 1 / (1 - 2 * k), _UNLIMITED)
     rise = 2 * b * gain
@@ -171,8 +171,8 @@ class SmoothMotion:
 def braking_bounds(
     limits: ArmLimits, q: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Like `ArmLimits.velocity_bounds`, but so slow near the end of a range that the joint can stop
-    before it."""
+    """Returns `ArmLimits.velocity_bounds`, lowered near the ends of the ranges so that each joint
+    can stop in time."""
     low, high = limits.velocity_bounds(q)
     # Assume half of the limit of acceleration, because limited jerk delays the braking.
     brakes = np.array(limits.acceleration)

@@ -80,7 +80,7 @@ class PickPlaceParameters:
     peak_grasp_force: float = bounded(140.0, 1.0, 140.0)
     heaviest_load: float = bounded(20.0, 0.5, 100.0)
 
-    # Below this width between the squeezing pads the grasp counts as empty, in m.
+    # A grasp counts as empty if the squeezing pads are closer to each other than this, in m.
     minimum_width: float = bounded(0.0005, 0.0, 0.08)
 
     # Force in N with which closed jaws press down an object that sticks out of its cavity, and the
@@ -89,7 +89,8 @@ class PickPlaceParameters:
     press_force: float = bounded(30.0, 1.0, 140.0)
     press_depth: float = bounded(0.020, 0.001, 0.05)
 
-    # A vertical contact force above the payload's weight that counts as contact, in N.
+    # A vertical contact force that exceeds the payload's weight by more than this, in N, is a
+    # contact.
     contact_threshold: float = bounded(4.0, 0.5, 100.0)
 
     # A contact force on the hand beyond this, in N, ends the action: the hand stops, lets go and
@@ -118,8 +119,8 @@ class PickPlaceParameters:
     contact_speed: float = bounded(0.05, 0.005, 1.0)
     touch_speed: float = bounded(0.015, 0.002, 1.0)
 
-    # The hand slows down this far above the first possible and above the expected contact, in m,
-    # plus the uncertainty of the heights.
+    # The hand slows down this far, in m, above the first possible contact and again above the
+    # expected contact. The uncertainty of the heights is added.
     slow_margin: float = bounded(0.001, 0.0, 0.02)
 
     # Parameters of the search after a blocked insertion. Used only in tasks that insert objects
@@ -133,7 +134,7 @@ class PickPlaceParameters:
     # is released slowly swings about the pads.
     force_ramp: float = bounded(0.03, 0.0, 5.0)
 
-    # How long the hand rests before the cameras look and before the payload is tared, in s.
+    # How long the hand rests, in s, before the cameras look, and before the payload is tared.
     observe_settle: float = bounded(0.10, 0.0, 10.0)
     tare_settle: float = bounded(0.10, 0.0, 10.0)
 

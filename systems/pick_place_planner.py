@@ -87,7 +87,7 @@ class PickPlacePlanner(LeafSystem):
       last action, without the weight of the held object, in N, as means over 1/64 s; then the
       `Mode` in which the larger of the two occurred. See `ContactGuard`.
     - `payload` (1): the vertical force of the object that the hand lifts, carries or lowers, in N:
-      as it is felt, and as soon as it has been weighed, its weight. It is negative or zero.
+      the measured force until the object has been weighed, then its weight. It is negative or zero.
     - `asks` (1): 1 if the planner's next update, at the context's time, will evaluate `action`;
       else 0.
     - `accepted_action` (abstract, `PickPlaceAction`): the action that began last, with the hand's
@@ -111,9 +111,9 @@ class PickPlacePlanner(LeafSystem):
       axis of the pads, the more firmly it is gripped (`grip_force`), but less firmly if the jaws
       sink in (`soft_force`). A heavy object is lifted only once the grip is firm. A floating hand
       moves it with less acceleration (`gentleness`).
-    - `LIFT`: if the object is heavy or that moment is notable, the hand lifts it by 1 cm first, and
-      rests. If the object turns between the pads, or the moment is more than
-      friction holds on the way (`slips_when_carried`), it is set down again. The history then
+    - `LIFT`: if the object is heavy or its moment about the axis of the pads is notable, the hand
+      lifts it by 1 cm first, and rests. If the object turns between the pads, or the moment is more
+      than friction holds on the way (`slips_when_carried`), it is set down again. The history then
       contains the estimated centre of mass, so that a policy can grip the object there.
     - `RELEASE`: if the jaws stick to the object, they open with force.
     - `SEARCH`: in tasks that insert objects into cavities, if the object stands on the rim around
@@ -352,7 +352,7 @@ class PickPlacePlanner(LeafSystem):
 
 
 def _action_of(state: PlannerState) -> PickPlaceAction:
-    """The last action begun, or the stop, without heights."""
+    """Returns the action that began last, or the stopping action after a stop, without heights."""
     pick, place = (PlanarPose(*map(float, pose)) for pose in (state.pick, state.place))
     return PickPlaceAction(
         pick,

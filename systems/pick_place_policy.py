@@ -54,7 +54,7 @@ class PickPlacePolicy(LeafSystem):
       `observation.history`. If not connected, the observation's own history stays.
     - `action` (abstract, `PickPlaceAction`): the policy's action.
 
-    Evaluating the port calls the policy once for each new input. The policy must be stateless: the
+    Evaluating `action` calls the policy once for each new input. The policy must be stateless: the
     Context does not hold its memory. Any memory must enter through an input port.
     """
 

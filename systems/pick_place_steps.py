@@ -30,14 +30,14 @@ _STEADY = 0.6
 """If an object's moment about the pads falls below this share of its earlier value, it has
 turned."""
 _STUCK = 0.004
-"""If the jaws have opened by this much less than commanded, they stick to the object, in m."""
+"""Jaws that have opened by this much less than commanded, in m, stick to the object."""
 _PUSH = 1 / 3
 """Jaws that stick are opened with this share of the grasp force, in addition to the force by which
 they follow their command."""
 _LONGEST_RELEASE = 1.0
-"""After this time the hand rises even if the jaws stick, in s."""
+"""After this time, in s, the hand rises even if the jaws stick."""
 _RISEN = 0.0005
-"""The hand counts as lifted when it is this far above its height at the grip, in m."""
+"""The hand counts as lifted when it is this far, in m, above its height at the grip."""
 
 
 @dataclass(frozen=True)
@@ -200,7 +200,7 @@ class PickPlaceSteps:
             self.hold(moment)
 
     def _doubts_grip(self, moment: Moment, weight: float, turning: float) -> bool:
-        """Whether to see first how the object hangs."""
+        """Whether a trial lift must show first how the object hangs."""
         state = moment.state
         if moment.wrist_moment is None or state.trusts_grip:
             return False
@@ -264,15 +264,15 @@ class PickPlaceSteps:
             self._motion.begin(state, Mode.LOWER, time)
 
     def _grip(self, moment: Moment, weight: float, turning: float) -> float:
-        """Grips as firmly as an object needs.
+        """Adapts the grip force to the object.
 
         Args:
             moment: the inputs.
-            weight: what the hand feels, in N.
+            weight: the weight that the hand feels, in N.
             turning: the moment about the axis of the pads while the hand rests, in N m.
 
         Returns:
-            The force of each pad in the end, in N.
+            The force of each pad after its ramp, in N.
         """
         state, hand, parameters = moment.state, moment.hand, self._parameters
         present = float(state.goal_force)

@@ -37,7 +37,7 @@ metres."""
 _NEAR = 0.05
 """Only an object within this distance of a goal is tested for filling it, in metres."""
 _FREE_ANGLES = 24
-"""Number of headings compared for a goal of any heading."""
+"""Number of headings that are compared for a goal that accepts any heading."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,8 @@ class PlacedObject:
     """Order of the object's rotational symmetry about body z; 1 for none."""
     axis: tuple[float, float] | None = None
     """(x, y) of the axis of symmetry in B, in metres; None stands for the middle of the points'
-    bounding box. The two differ if the order of the symmetry is odd, as for a triangle."""
+    bounding box. This middle is not on the axis if the order of the symmetry is odd, as for a
+    triangle."""
     p_BCom: NDArray[np.float64] | None = None
     """(3,) the centre of mass in B, in metres; None if it is unknown."""
 
@@ -419,7 +420,7 @@ def _measure(
 def complete_stages(
     goals: Sequence[Goal], placements: Sequence[Placement], kept: Set[int] = frozenset()
 ) -> frozenset[int]:
-    """Finds the goals of all stages that have been complete. A stage is the set of goals that are
+    """Finds the goals of all stages that are or were complete. A stage is the set of goals that are
     prerequisites of one other goal; it is complete when all of them are filled at the same time.
 
     As in the Ravens benchmark, the reward of a complete stage is kept even if its objects move

@@ -58,12 +58,12 @@ class PlannerState(VectorView):
     held_width = Number()
     """The opening of the jaws when they had gripped, in m."""
     gentleness = Number()
-    """The share of the acceleration limits with which the held object is moved; 0: all of it."""
+    """The share of the acceleration limits with which the held object is moved; 0 stands for 1."""
     search_step = Number()
     payload = Number()
     """The vertical force of the payload on the hand, in N; negative or zero."""
     felt_payload = Number()
-    """The last such force that was felt before the payload was weighed."""
+    """The last vertical force of the payload, in N, before the payload was weighed."""
     weighings = Number()
     """Number of samples in the mean that gives `payload`."""
     beyond = Number()
@@ -93,11 +93,11 @@ class PlannerState(VectorView):
     """Position of the object's centre of mass relative to the pads' middle, along the pads, in m,
     if the object is set down again."""
     trial_weight = Number()
-    """The largest weight felt in the trial lift, when the table bore least of it, in N."""
+    """The largest weight felt in the trial lift, in N. The table then bears least of the object."""
     doubts_grip = Number()
     """1 during a trial lift of an object that may turn between the pads, else 0."""
     trusts_grip = Number()
-    """1 if the object hung still in its trial lift, else 0."""
+    """1 if the object did not turn in its trial lift, else 0."""
     set_downs = Number()
     """Number of earlier actions that set this object down again."""
     free_actions = Number()

@@ -29,7 +29,7 @@ class RobotMotion(Protocol):
         """A state in which the hand waits at home with open jaws."""
 
     def view(self, vector: NDArray[np.float64]) -> PlannerState:
-        """Names the fields of a state vector, without a copy."""
+        """Returns a view of a state vector with named fields, without a copy."""
 
     def prepare(self, state: PlannerState) -> bool:
         """Chooses how to execute an action before it begins.
@@ -66,7 +66,7 @@ class RobotMotion(Protocol):
         """Raises the goal of the present mode, a straight line of the hand, by a distance."""
 
     def slow_down(self, state: PlannerState, time: float, share: float) -> None:
-        """Goes on with the present mode, and carries the object, with less acceleration.
+        """Goes on with less acceleration, in this mode and in later ones that move the object.
 
         Args:
             state: the planner's state; modified.

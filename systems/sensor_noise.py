@@ -20,8 +20,9 @@ SHEEN_LABELS = 20000
 """The render label SHEEN_LABELS + p marks a shiny surface, p percent of which become holes."""
 
 _RIG_STREAM, _CAMERA_STREAM, _DEPTH_STREAM = 14, 15, 16
-"""Numbers of this module's random streams, which NumPy gets together with the seed. Other modules
-use smaller numbers. Zero is avoided, because NumPy treats [seed, 2, 0] like [seed, 2]."""
+"""Numbers of this module's random streams, which NumPy gets together with the seed. Each stream of
+the package has its own number. Zero is avoided, because NumPy treats [seed, 2, 0] like [seed,
+2]."""
 _TIME_RESOLUTION = 1e-6
 """Images farther apart in time than this, in seconds, have independent noise."""
 _HOLE_RADIUS = 3.0
@@ -52,7 +53,7 @@ class SensorNoiseParameters:
     # Share of the pixels that are holes, which have no depth.
     hole_share: float = bounded(0.0, 0.0, 0.9)
 
-    # Surfaces seen at more than this angle from their normal give no depth, in degrees.
+    # Surfaces seen at more than this angle from their normal, in degrees, give no depth.
     steepest_deg: float = bounded(90.0, 1.0, 90.0)
 
     # Number of images per observation; each pixel gets their median depth. The time to take them,

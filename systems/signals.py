@@ -38,7 +38,7 @@ class PixelGrid:
     z_min: float = 0.0
     """World z of the height zero in heightmaps, in metres."""
     z_max: float = 0.28
-    """Points above this world z are dropped, in metres."""
+    """Points above this world z, in metres, are dropped."""
 
     def __post_init__(self) -> None:
         if self.rows < 1 or self.cols < 1 or self.resolution <= 0:
@@ -279,8 +279,8 @@ class Attempt:
     peak_force: float = 0.0
     """The largest contact force on the hand, in N, without the weight of the held object."""
     balance: tuple[float, float] | None = None
-    """World (x, y), in metres, of the object's centre of mass, as far as its position along the
-    pads was measured before the object was set down; None for any other outcome."""
+    """World (x, y), in metres, of the object's centre of mass, estimated from the moment on the
+    wrist if the outcome is "set down"; else None. Only the position along the pads is measured."""
 
 
 def wrap_to_pi(angle: float) -> float:

@@ -25,7 +25,7 @@ _SUPPORT_SHARE = 10.0
 _TABLE_SHARE = 5.0
 """Percentile of all heights that estimates the table's height."""
 _CLEAN = 0.0003
-"""A smaller standard deviation counts as no noise, in metres."""
+"""A standard deviation below this, in metres, counts as no noise."""
 _LEAST_FLAT = 500
 """Least number of flat squares that is enough to decide whether there is noise."""
 _SMOOTHED = 9
@@ -34,16 +34,16 @@ average."""
 _FLAT = 0.012
 """Squares whose heights range over more than this, in metres, contain edges and are not flat."""
 _NOISY_RIM_SHARE, _NOISY_RIM_BIAS = 90.0, 1.0
-"""Percentile of the heights around a place that estimates its rim's height, and its bias in
-standard deviations. About two thirds of these pixels belong to the rim."""
+"""Percentile of the heights around a place that estimates its rim's height, and the bias of this
+estimate in standard deviations. About two thirds of these heights belong to the rim."""
 _NOISY_FLOOR_SHARE, _NOISY_FLOOR_BIAS = 25.0, -0.67
-"""Percentile of the heights at a place that estimates its floor's height, and its bias in standard
-deviations."""
+"""Percentile of the heights at a place that estimates its floor's height, and the bias of this
+estimate in standard deviations."""
 _SUNK = 0.003
 """A table that looks lower than expected by more than this, in metres, is assumed to be lower."""
 _TILT_DOUBT, _MOST_DOUBT = 0.3, 0.0025
-"""The uncertainty of heights after levelling is this share of the table's deviation, but at most
-the second number, in metres."""
+"""The uncertainty of heights after levelling is a share `_TILT_DOUBT` of the table's deviation, but
+at most `_MOST_DOUBT`, in metres."""
 
 
 def read_surface_heights(

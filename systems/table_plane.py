@@ -8,18 +8,18 @@ from numpy.typing import NDArray
 _STEP = 2
 """Only every second row and every second column is used, to save time."""
 _LEAST = 200
-"""Least number of these pixels that must lie on the table."""
+"""Least number of used pixels that must lie on the table."""
 _LEAST_SHARE = 0.15
 """Least share of the seen pixels that must lie on the table."""
 _BIN = 0.001
 _FAR = 0.03
 """The table is sought within this distance of the bottom of the grid, in metres."""
 _BAND = 0.004
-"""Pixels within this distance of a plane, in metres, or within three times the noise if that is
-more, belong to it."""
+"""A pixel belongs to a plane if it is within this distance, in metres, or within three times the
+noise if that is more."""
 _FITS = 8
 _LEVEL = 0.0003
-"""A table with smaller deviations counts as level, in metres."""
+"""A table whose deviations are smaller than this, in metres, counts as level."""
 _MOST_OFF, _STEEPEST = 0.010, 0.035
 """A larger offset (in metres) or slope cannot be an error of calibration, and is not corrected."""
 

@@ -22,7 +22,7 @@ class FingerLaw:
 
         u_finger = clip(k_w (w_d - w)/2 + d_w (w_d' - w')/2 - f, -f_max, f_max).
 
-    The plant's mimic constraint centres the pair.
+    The plant's mimic constraint keeps both fingers at the same distance from the middle.
     """
 
     stiffness: float
@@ -98,7 +98,7 @@ class TrajectoryController(LeafSystem):
 
         Args:
             inertia: effective inertia M of each axis, in kg and kg m^2.
-            weight: gravity on the moving mass, in N, held by the z axis.
+            weight: weight of the moving mass, in N, which the z axis holds.
             stiffness: stiffness k_p, in N/m and N m/rad.
             damping: damping k_d, in N s/m and N m s/rad.
             force_limit: largest force u_max, in N and N m.

@@ -36,8 +36,8 @@ class WristForce(LeafSystem):
     - `wrist_force` (6): contact forces along x, y, z (N), the moment about z (N m), and the force
       on each finger (N), at the gripper frame G and in the world's axes. It is the input
       `hand_contact_force` of the `PickPlacePlanner`.
-    - `wrist_moment` (1): their moment at G about G's y axis, along which the jaws close, in N m. It
-      is the planner's input of that name.
+    - `wrist_moment` (1): the moment of the contact forces at G about G's y axis, along which the
+      jaws close, in N m. It is the planner's input of that name.
 
     The spatial force F on the hand at G solves, in the sense of least squares,
 
@@ -90,7 +90,7 @@ class WristForce(LeafSystem):
 
     def _calc_moment(self, context: Context, output: BasicVector) -> None:
         moment = self._spatial_force(context)[:3]
-        # The spatial force has set the scratch context.
+        # `_spatial_force` has set the positions in the scratch context.
         jaws = self._gripper.CalcPoseInWorld(self._scratch).rotation().col(1)
         output.SetFromVector([moment @ jaws])
 
