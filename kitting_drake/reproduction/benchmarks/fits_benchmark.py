@@ -62,12 +62,12 @@ FITS = [
 def measure_fits(
     episodes: int, seed: int, folder: Path, console: Console, fits: Sequence[Fit] = tuple(FITS)
 ) -> dict[str, Any]:
-    """Runs the episodes of all conditions, seed by seed; skips those that are in the folder
-    already.
+    """Runs the episodes of all conditions, seed by seed. Episodes that are in the folder already
+    are skipped.
 
     Args:
         episodes: the number of episodes for each of the conditions.
-        seed: the first seed; the others follow.
+        seed: the first of the successive seeds.
         folder: the folder of `episodes.jsonl`.
         console: the console for the progress.
         fits: the conditions.

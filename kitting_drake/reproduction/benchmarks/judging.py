@@ -25,8 +25,8 @@ _TOUCHED, _HELD = 4e-6, 2e-5
 more than `_TOUCHED`. The jaws hold an object if the part of it between the pads is larger than
 `_HELD`."""
 PLACE_OFF = 0.0035
-"""The largest distance, in metres, of 95 % of the placed outline from the outline at the goal, for
-a right place."""
+"""A place is right if 95 % of the placed outline is within this distance, in metres, of the outline
+at the goal."""
 
 
 def judge(action: PickPlaceAction, loose: Sequence[LooseTool]) -> str:
@@ -96,7 +96,7 @@ def _placed(footprint: CrossSection, X_W: RigidTransform) -> CrossSection:
 
 
 def _outline(footprint: CrossSection, X_W: RigidTransform) -> Array:
-    """Returns points (n, 2) of the outline at a pose, evenly spread."""
+    """Returns evenly spaced points (n, 2) of a footprint's outline at a pose."""
     points = []
     for polygon in _placed(footprint, X_W).to_polygons():
         ends = np.roll(polygon, -1, axis=0)

@@ -55,7 +55,7 @@ def benchmark_kits(count: int | None, console: Console) -> dict[str, Any]:
 
 
 def kits_table(measured: dict[str, Any]) -> Table:
-    """The measurements as a table for the terminal."""
+    """Makes a table of the measurements for the terminal."""
     table = numbers_table(f"{measured['kits']} kits, one core", "what", "measured")
     build, triangles = measured["build_s"], measured["contact_triangles"]
     clearance = measured["clearance_mm"]

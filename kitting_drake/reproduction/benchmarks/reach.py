@@ -26,13 +26,13 @@ from systems.signals import PixelGrid
 _LEVELS = 4
 """The number of heights at which the reach is measured."""
 _LOWEST = 0.02
-"""The lowest of these heights, above the table, in m."""
+"""The lowest height at which the reach is measured, above the table, in m."""
 _SPACING, _COARSE = 0.025, 0.10
 """The spacing of the map's points, and of the points for the search, in m."""
 _AROUND = 0.8
 """The largest distance of a searched base from the workspace, in m."""
 _STEP, _FINER = 0.10, 0.05
-"""The spacing of the bases in the first search, and around its best base in the second, in m."""
+"""The spacing of the bases in the first search, and around its best bases in the second, in m."""
 _TURNS = (0.0, -45.0, 45.0, 180.0)
 """The yaws of the base to try, relative to the yaw at which it faces the workspace, in degrees."""
 
@@ -82,7 +82,8 @@ def _base_record(base: ArmBase) -> dict[str, Any]:
 
 
 def _points(grid: PixelGrid, spacing: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Returns the x and the y of the middles of cells whose size is about the spacing."""
+    """Divides the grid into cells of about the given size; returns the x and the y of their
+    middles."""
 
     def middles(low: float, high: float) -> NDArray[np.float64]:
         count = max(round((high - low) / spacing), 1)
@@ -247,7 +248,7 @@ def _draw_bases(axes: Axes, measured: dict[str, Any]) -> None:
 
 
 def _mark(axes: Axes, record: dict[str, Any], colour: str, label: str = "") -> None:
-    """Draws an arrow at a base, along its x."""
+    """Draws an arrow at a base, along the base's x axis."""
     (x, y, _), yaw = record["base"], math.radians(record["yaw_deg"])
     axes.plot([y], [x], "o", color=colour, ms=7, label=label or None)
     tip = (y + 0.1 * math.sin(yaw), x + 0.1 * math.cos(yaw))

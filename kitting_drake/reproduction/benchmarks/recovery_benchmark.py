@@ -221,7 +221,7 @@ def benchmark_recovery(
     Args:
         chosen: the scenario with the tested policy.
         episodes: the number of episodes with each disturbance.
-        seed: the first seed; the others follow.
+        seed: the first of the successive seeds.
         console: the console for the progress.
 
     Returns:

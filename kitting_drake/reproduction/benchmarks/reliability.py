@@ -46,7 +46,7 @@ _CAMERAS = {
 _RANDOM_VIEWS = 0.7
 """The share of scenes with random cameras. The other scenes have the default cameras."""
 _EVERY = 4
-"""The stride between used scenes of a seed; the scenes of a seed share their tools."""
+"""Every fourth scene of a seed is used, because the scenes of a seed share their tools."""
 _WITHOUT_KIT = 0.1
 """The share of scenes without a kit."""
 _DECISIONS = 3
@@ -95,7 +95,7 @@ def measure_reliability(
         weights: the file of the networks; None for the generalist.
         folder: the folder for `decisions.jsonl`, and for `confidence.json` if `fits`.
         console: the console for the progress.
-        fits: whether to fit the confidence to these decisions, instead of using the fitted one.
+        fits: whether to fit the confidence to these decisions; else the existing fit is used.
 
     Returns:
         A summary of each policy's decisions, by the number of cameras.

@@ -1,4 +1,4 @@
-"""Measures the time of episodes by phase, of starting up, and of images (`benchmark
+"""Measures the wall time of episodes by phase, of starting up, and of rendering images (`benchmark
 simulation`)."""
 
 import os
@@ -35,7 +35,7 @@ def benchmark_simulation(episodes: int, seed: int, console: Console) -> dict[str
 
     Args:
         episodes: the number of episodes for the oracle, and the same number for the learned policy.
-        seed: the first seed; the others follow.
+        seed: the first of the successive seeds.
         console: the console for the progress.
     """
     # Limit PyTorch to one thread before it is loaded, as for each worker of `evaluate`.
@@ -66,8 +66,8 @@ def benchmark_simulation(episodes: int, seed: int, console: Console) -> dict[str
 def _whole_episodes(
     path: Path, episodes: int, seed: int, stopwatch: "PhaseStopwatch", console: Console
 ) -> dict[str, Any]:
-    """Runs whole episodes; returns the cost per placed object, without the time to build
-    stations."""
+    """Runs whole episodes. Returns their times per placed object; the time to build stations does
+    not count."""
     scenario = load_scenario(path)
     simulated = wall = kitted = 0.0
     for number in track(
@@ -113,11 +113,12 @@ class PhaseStopwatch:
         self._last = (0.0, 0.0)
 
     def start(self) -> None:
-        """Starts an episode."""
+        """Starts the clock of an episode."""
         self._last = (0.0, time.perf_counter())
 
     def observe(self, event: ModeChange) -> None:
-        """Adds the time since the last event to the previous mode. It is an `EpisodeObserver`."""
+        """Adds the time since the last event to the previous mode. This method is an
+        `EpisodeObserver`."""
         now = (event.root_context.get_time(), time.perf_counter())
         name = event.previous.name.lower()
         simulated, wall = self.phases.get(name, (0.0, 0.0))

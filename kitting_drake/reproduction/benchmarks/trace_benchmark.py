@@ -39,7 +39,7 @@ TOOLS = (
 HEIGHTS_MM = (5.0, 12.0, 20.0)
 TILTS = (4.0, 15.0, 25.0)
 GAP_MM = 2.0
-"""The width of gaps that `gapless` errors leave out."""
+"""Gaps narrower than this are closed before `gapless` errors are measured."""
 _SAMPLE_MM = 0.25
 _SEEDS_APART = 10_000
 
@@ -55,8 +55,9 @@ def benchmark_trace(
 ) -> dict[str, Any]:
     """Draws three photos of each tool, traces them and measures the outlines, in mm.
 
-    Outlines without a doubt are also measured apart. A tool's sides hide narrow gaps, and its
-    cavity bridges them, so there are also errors without gaps below `GAP_MM`.
+    The errors of outlines about which the tracer has no doubts are given separately as well. A
+    tool's sides hide narrow gaps, and its cavity bridges them, so there are also errors without
+    gaps below `GAP_MM`.
 
     Args:
         names: the names of the tools.
@@ -109,7 +110,7 @@ def drawn_case(
 ) -> tuple[PhotoSpec, PlacedTool]:
     """Draws the conditions of the k-th photo of a tool.
 
-    They cover three heights and tilts, both grounds, and light from all sides.
+    All photos together cover three heights and tilts, both grounds, and light from all sides.
     """
     index += _SEEDS_APART * seed
     rng = np.random.default_rng(1000 + index)
@@ -143,7 +144,7 @@ def drawn_case(
 
 
 def outline_errors(traced: CrossSection, true: CrossSection) -> Points:
-    """Returns the distances (n,) of points on each outline from the other, in mm.
+    """Returns the distances (n,) of points on each of two outlines from the other outline, in mm.
 
     The outlines are first moved onto each other.
     """

@@ -326,13 +326,13 @@ def _skin(
 
 
 def _fine(pixels: Array) -> Array:
-    """Converts pixels to a picture of twice the resolution, in the sixteenths of a pixel that
-    OpenCV uses."""
+    """Converts pixel coordinates to those in a picture of twice the resolution, in sixteenths of a
+    pixel, as OpenCV's drawing functions expect."""
     return np.round(16 * (2 * pixels + 0.5)).astype(np.int32)
 
 
 def _filled(cv2: Any, loops: list[Array], size: tuple[int, int]) -> Array:
-    """Returns the share of each pixel that lies inside loops of pixels (n, 2)."""
+    """Returns the share of each pixel that lies inside closed loops of pixel coordinates (n, 2)."""
     mask = np.zeros((2 * size[1], 2 * size[0]), np.uint8)
     cv2.fillPoly(mask, [_fine(loop) for loop in loops], 255, 8, 4)
     return cv2.resize(mask, size, interpolation=cv2.INTER_AREA).astype(np.float32) / 255
@@ -358,8 +358,8 @@ def _srgb(linear: Array) -> Array:
 def placed_outline(
     outline: CrossSection, spec: PhotoSpec, angle: float, shift: tuple[float, float]
 ) -> CrossSection:
-    """Moves an outline so that the middle of its bounds lies at the sheet's middle plus `shift`,
-    turned by `angle`."""
+    """Turns an outline by `angle` degrees and moves the middle of its bounds to the sheet's middle
+    plus `shift`, in mm."""
     outline = outline.rotate(angle)
     x_low, y_low, x_high, y_high = outline.bounds()
     x = spec.sheet[0] / 2 + shift[0] - (x_low + x_high) / 2

@@ -58,7 +58,8 @@ class Convolutions:
         return cls(recorder.calls)
 
     def alone(self, device: torch.device) -> dict[Any, Callable[[], object]]:
-        """Returns, for each key of `calls`, a function that computes it once on random numbers."""
+        """Returns, for each key of `calls`, a function that computes the call once on random
+        numbers."""
         return {call: _replay(*call, device) for call in self.calls}
 
     def seconds(self, timings: dict[Any, Timing]) -> float:

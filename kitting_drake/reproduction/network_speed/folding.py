@@ -32,10 +32,11 @@ def measure_folding(setup: SpeedSetup) -> dict[str, Any]:
     Returns:
         - `rungs`: the time of each of `MEASURES`, for each variant;
         - `speed_up`: the speed of each variant relative to plain escnn in float32;
-        - `convolution_share`: for the variants of this package, the share of a training step and of
-        a decision that plain torch needs for convolutions of the same shapes and type;
+        - `convolution_share`: for the variants of this package, the share of the time of a training
+          step and of a decision that plain torch needs for convolutions of the same shapes and
+          type;
         - `alpha_difference`: the difference of alpha's output from plain escnn's, relative to its
-        standard deviation;
+          standard deviation;
         - `alpha_operations`: the operations of one inference of alpha.
     """
     ways = _ways(setup)

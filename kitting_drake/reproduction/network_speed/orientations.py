@@ -82,7 +82,7 @@ def measure_pick_angles(setup: SpeedSetup, preset: str) -> list[dict[str, Any]]:
 
 
 def _cells(plan: Plan) -> Iterator[tuple[str, tuple[int, ...]]]:
-    """Yields each method with the values of N for which one set of its networks is enough."""
+    """Yields each method with the values of N at which one set of its networks can predict."""
     for method in METHODS:
         if method in _MADE_FOR_N:
             yield from ((method, (n,)) for n in plan.orientations)

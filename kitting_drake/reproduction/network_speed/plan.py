@@ -50,7 +50,7 @@ class Plan:
     """The number of timings for each median."""
     peak_side: int = 2048
     """The side of the matrices whose product gives the peak rate. On an accelerator it is four
-    times that."""
+    times as long."""
     budget: float = 60.0
     """The time for each number, in seconds. Measurements that would take longer are skipped."""
     demonstrations: Path | None = None
@@ -165,8 +165,8 @@ def synthetic_scene(grid: PixelGrid) -> ObservedScene:
     image[3] = 0.0
 
     def bar(middle: NDArray[np.float64], angle: float, length: float, width: float) -> Any:
-        """Returns the pixels (rows, cols) of a bar; lengths in metres, along the rows at angle
-        0."""
+        """Returns the mask (rows, cols) of a bar. Lengths are in metres. At angle 0 the bar extends
+        along the row index."""
         along, across = np.moveaxis(np.abs((pixel - middle) @ rotation_matrix(angle)), -1, 0)
         half = 0.5 * np.array([length, width]) / grid.resolution
         return (along <= half[0]) & (across <= half[1])

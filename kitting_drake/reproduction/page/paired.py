@@ -16,7 +16,7 @@ _RESAMPLES = 10_000
 _TAILS = (2.5, 97.5)
 """The percentiles of a 95 % interval."""
 _FEWEST_TOOLS = 3
-"""The least number of tools that ever fail at which a bootstrap over tools is informative."""
+"""A bootstrap over tools is informative if at least this many tools ever fail."""
 
 STRICT, OWN = "strict_success_rate", "success_rate"
 """The two rates of an episode: of strict success, and of success by the task's own measure."""
@@ -97,7 +97,7 @@ def over_tools(outcomes: Sequence[Mapping[str, Any]], rate: str) -> Estimate | N
         rate: `STRICT` or `OWN`.
 
     Returns:
-        None if fewer than three tools ever fail, or ever succeed.
+        The estimate; None if fewer than three tools ever fail, or ever succeed.
     """
     needed = 2 if rate == STRICT else 1
     counts: dict[str, list[bool]] = defaultdict(list)

@@ -144,8 +144,8 @@ def _own(summary: dict[str, Any]) -> str:
 
 
 def _most_tested_run(runs: list[Run]) -> list[str]:
-    """Writes tables by category, of the most tested network, or of the most tested run without
-    one."""
+    """Writes tables by category for the network with the most episodes or, if no run has a network,
+    for the run with the most episodes."""
     learned = [run for run in runs if run.method in LEARNED]
     # Do not take the best run, which may be the luckiest of those with few episodes.
     most = max(learned or runs, key=lambda run: (run.summary["episodes"], run.name))
@@ -181,7 +181,7 @@ def _most_tested_run(runs: list[Run]) -> list[str]:
 
 
 def _causes(runs: list[Run]) -> list[str]:
-    """Writes why objects were no strict success: a row for each run, best first."""
+    """Writes a table of the causes of failure, with a row for each run, best first."""
     causes = list(dict.fromkeys(cause for run in runs for cause in run.summary["causes"]))
     rows = []
     for run in sorted(runs, key=lambda run: -run.summary["strict_success_rate"]):

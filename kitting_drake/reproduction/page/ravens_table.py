@@ -79,7 +79,7 @@ def ravens_section(runs: Sequence[Run]) -> list[str]:
     headings = ["method", "N", "demonstrations", *TASKS]
     return [
         "### The five Ravens tasks, by default\n",
-        "With sub-pixel and sub-bin refinement. A cell has the mean reward in percent, its 95 % "
-        "interval\nand the number of episodes.\n",
+        "Actions are refined to less than a pixel and a bin. A cell has the mean reward in "
+        "percent, its 95 %\ninterval and the number of episodes.\n",
         markdown_table(headings, rows),
     ]

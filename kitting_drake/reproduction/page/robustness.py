@@ -28,14 +28,14 @@ _COMPARED = ("generalist, minus unperturbed", "generalist, minus shape matching"
 """The paired differences, in points, on the seeds that both runs have."""
 _TRIES = 2
 _FRAMES = 5
-"""The number of images that are averaged in further rows."""
+"""The number of images per observation in further rows."""
 _SEEDS = range(2870, 2895)
 """The seeds of all cells of the first table. They were unseen before their first run."""
 _FEWEST = 12
 """The least number of these seeds, counted from the first, for levels other than moderate."""
 
 Key = tuple[str, str]
-"""A row of the table, and a method."""
+"""The label of a row of the table, and a method."""
 
 
 def robustness_table(runs: Sequence[Run]) -> str:

@@ -67,9 +67,9 @@ _HAND = (
     "planner.search.speed",
 )
 _EARLIER_HAND = "an earlier hand"
-"""The label of runs whose summaries lack the planner's fields above. In them the hand did not grip
-heavy objects more firmly, press objects down or search in a spiral. Grasps narrower than 3 mm
-counted as failed."""
+"""The label of runs whose summaries lack the fields `_HAND`. In them the hand did not grip heavy
+objects more firmly, press objects down or search in a spiral. Grasps narrower than 3 mm counted as
+failed."""
 
 _UNLIMITED_HAND = {"lower_speed": 0.08, "minimum_width": 0.0015}
 """The planner's defaults in runs in which no contact force ended an action."""
@@ -82,8 +82,8 @@ _LIMITED_HAND = (
     "touch_speed",
     "slow_margin",
 )
-"""Fields of the planner that the summaries of these runs lack. They count as runs of the present
-hand; the page of results says how many they are."""
+"""Fields of the planner that are missing in the summaries of runs with `_UNLIMITED_HAND`. Such runs
+count as runs of the present hand; the page of results says how many they are."""
 
 _MOST_SHOWN = 4
 """The largest number of differences of one run that are listed. Further ones are only counted."""
@@ -204,7 +204,7 @@ def has_unlimited_hand(scenario: Mapping[str, Any]) -> bool:
 def _with_present_hand(planner: dict[str, Any]) -> dict[str, Any]:
     """Returns the planner of a run of an older version with today's defaults.
 
-    They replace the defaults of that version, and fill in the fields that it lacks.
+    Today's defaults replace those of that version, and fill in the fields that it lacks.
     """
     defaults = _defaults()["planner"]
     former = [key for key, value in _UNLIMITED_HAND.items() if planner.get(key) == value]
@@ -305,7 +305,7 @@ def check_summary(summary: Any, where: str) -> None:
 
     Args:
         summary: the content of a file, or of a row.
-        where: its origin, for the error message.
+        where: the file and the run that it is from, for the error message.
 
     Raises:
         UserError: a field is missing or of another type.

@@ -17,7 +17,7 @@ from kitting_drake.reproduction.paper.learning_rates import Rates
 from kitting_drake.reproduction.paper.paper_tables import paper_cells
 
 MISSING, TO_RUN_AGAIN = "-", "- ‡"
-"""The text of a cell that was not run, and that of a cell whose run is not reproducible."""
+"""The texts of a cell that was not run, and of a cell whose run is not reproducible."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,9 @@ def check_cell(cell: Cell, summary: Summary, rates: Rates) -> None:
         if departure is None and not isinstance(summary["outcomes"], list):
             departure = "its outcomes are not a list"
     except (KeyError, TypeError, AttributeError) as error:
-        raise UserError(f"run '{cell.name}' is not a summary of evaluate: {error!r}") from error
+        raise UserError(
+            f"run '{cell.name}' is not a summary of evaluate: a field is missing or of another type"
+        ) from error
     if departure is not None:
         raise UserError(
             f"run '{cell.name}' does not fit the cell of this name ({departure}): give it another "

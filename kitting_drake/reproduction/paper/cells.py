@@ -148,8 +148,8 @@ class Training:
     demonstrations: int
     seed: int = 0
     learning_rate: float | None = None
-    """The learning rate. None: the first of `LEARNING_RATES` for the SO(2) method, and for a
-    baseline the best one for its `reference`."""
+    """The learning rate. If None, it is the first of `LEARNING_RATES` for the SO(2) method, and the
+    best one of the `reference` for a baseline."""
     taken_only: bool = True
     """Whether only the action that was taken is a label, as in the paper."""
     rigid: bool = True
@@ -174,8 +174,8 @@ class Training:
 
     @property
     def steps(self) -> int:
-        """The number of steps. It is the same for all methods, as in the paper; with more labels it
-        is larger."""
+        """The number of steps. It is the same for all methods, as in the paper, and larger for
+        trainings with more labels or augmentation than the paper."""
         task = TASKS[self.task]
         more = 0 if self.taken_only and self.rigid else task.more_steps
         return self.times * (task.steps + more)
@@ -203,8 +203,8 @@ class Training:
 
 
 def reference(training: Training) -> Training:
-    """Returns the training that chooses the learning rate of a baseline. It has no rate of its own
-    yet."""
+    """Returns the training on which the learning rate of a baseline is chosen. The learning rate of
+    the returned training is not set."""
     return Training(TASKS[training.task].rates_from, training.method, 36, 100)
 
 
@@ -302,8 +302,8 @@ class Cell:
         if list(summary["seeds"]) != list(self.seeds):
             return f"its seeds are not {self.seeds[0]} to {self.seeds[-1]}"
         if isinstance(self.policy, str):
-            # Runs without this field avoided failed picks. The weights are identified by their
-            # digest.
+            # Runs without the field avoid_failed_picks avoided failed picks. The weights are
+            # identified by their digest.
             policies = (summary["resolved_scenario"]["policy"], expected["policy"])
             found, wanted = (
                 {"avoid_failed_picks": True} | policy | {"weights": ""} for policy in policies
@@ -313,7 +313,8 @@ class Cell:
             same = summary["policy_digest"] == _loaded(self).policy.digest(SCENARIOS / "paper")
             return None if same else "its weights are not those that come with the package"
         details = self._details(self.policy)
-        # Runs without this field avoided failed picks; the page of results estimates the effect.
+        # Runs without the field avoid_failed_picks avoided failed picks; the page of results
+        # estimates the effect.
         earlier = {"angle_only": False, "avoid_failed_picks": self.avoid_failed_picks}
         found = earlier | {"rotations": None} | summary["policy_details"]
         key = rates_key(reference(self.policy))

@@ -80,5 +80,6 @@ def efficiency_section(measured: Mapping[str, Any]) -> str:
 
 
 def _cost_text(row: Mapping[str, Any]) -> str:
-    """Returns the parameters, and the time or the reason why it is missing."""
+    """Returns, as text, the number of parameters and the time, or the reason why there is no
+    time."""
     return f"{count_text(row['parameters'])}, {row['skipped'] or seconds_text(row['seconds'])}"

@@ -21,7 +21,7 @@ _COLOURS = {10: "#009e73", 100: "#d55e00"}
 """Green and orange, as in the paper, which the colour-blind can distinguish."""
 _MARKERS = {"so2": "o", "equivariant_transporter": "s", "transporter": "^"}
 _STEP = 0.12
-"""The distance between the markers of one N."""
+"""The distance between the markers of one N. Successive N are at a distance of 1."""
 _ROWS = {
     ("so2", 36): ("#e69f00", "o"),
     ("so2", 180): ("#d55e00", "D"),
@@ -31,7 +31,8 @@ _ROWS = {
 """The rows of table I (method and N), with markers and with colours that the colour-blind can
 distinguish."""
 _ROW_STEP = 0.19
-"""The distance between the markers of one number of demonstrations."""
+"""The distance between the markers of one number of demonstrations. Successive numbers are at a
+distance of 1."""
 _STYLE = {
     "font.size": 13,
     "axes.edgecolor": "0.5",
@@ -91,7 +92,7 @@ def draw_figure_6(task: str, results: Mapping[str, Result]) -> bytes:
 def _draw_marker(
     axis: Axes, where: float, summary: Mapping[str, Any], method: str, count: int
 ) -> None:
-    """Draws both rates of a cell."""
+    """Draws the strict rate of a cell, and its rate by the paper's measure."""
     rate, (low, high) = summary["strict_success_rate"], summary["strict_ci95"]
     look = {"color": _COLOURS[count], "marker": _MARKERS[method], "linestyle": ""}
     axis.errorbar(

@@ -32,8 +32,8 @@ STEADIER = {
 best rate of their `reference`. They use its second-best rate. With ten demonstrations, the
 pick-angle loss diverged."""
 MATCHED = "matched"
-"""The preset in which the baselines have the same share of their originals' parameters as the SO(2)
-networks; see `paper.parameter_table`."""
+"""The preset in which a baseline has the same share of its original's parameters as the SO(2)
+networks have of theirs; see `paper.parameter_table`."""
 ROTATIONS = 18
 """The number of rotations, of 36, in a training step of the Transporter in the cells of
 `_every_chance`."""

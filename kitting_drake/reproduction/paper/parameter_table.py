@@ -1,6 +1,6 @@
 """Writes the table of the parameters of every network and of its original.
 
-The parameters are counted from the networks.
+The parameters are counted on the networks themselves.
 """
 
 from __future__ import annotations

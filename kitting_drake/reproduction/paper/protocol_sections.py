@@ -131,8 +131,8 @@ def _trainings(results: Mapping[str, Result], again: Collection[str]) -> list[st
 
 
 def _mean_rates(results: Sequence[Result]) -> str:
-    """Returns the means of both rates as text, with their standard deviations if there are
-    several."""
+    """Returns the means of the strict rate and of the rate by the paper's measure, as text. Several
+    results also give standard deviations."""
     texts = []
     for rate in (STRICT, OWN):
         percents = [100 * result.summary[rate] for result in results]

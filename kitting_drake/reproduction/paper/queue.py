@@ -285,7 +285,9 @@ def _check_training(training: Training, folder: Path) -> None:
     ):
         found = summary.get(key, _BEFORE.get(key))
         if found != wanted:
-            raise Failed(f"{folder}: {key} is {found}, not {wanted}: delete it")
+            raise Failed(
+                f"{folder} holds another training ({key} is {found}, not {wanted}): delete it"
+            )
 
 
 def _end(process: subprocess.Popen[str]) -> None:

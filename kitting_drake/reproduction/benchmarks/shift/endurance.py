@@ -90,7 +90,7 @@ def run_shift(
         chosen: the scenario.
         hours: the simulated length of the shift. The scene in progress at its end is finished.
         exchange: the time between two scenes, in s.
-        seed: the seed of the first scene; the others follow.
+        seed: the seed of the first scene; the scenes have successive seeds.
         folder: the folder of `scenes.jsonl`.
         workers: the processes that run the scenes.
         sent: the scenario with paths that are valid for the workers.
@@ -205,8 +205,8 @@ def _in_worker(workers: Workers, chosen: ChosenScenario, seed: int) -> ShiftScen
 
 
 def _lost(seed: int, why: str, wall_seconds: float = 0.0) -> ShiftScene:
-    """Makes the line of a scene of which only the reason of its failure is known; it is one
-    assist."""
+    """Makes the record of a scene of which only the reason of its failure is known. The scene
+    counts as one assist."""
     scene = ShiftScene(seed, 0.0, tools=0, assists={"scene": FAILED}, failure=why)
     scene.wall_seconds, scene.commit = wall_seconds, commit()
     return scene
@@ -258,7 +258,7 @@ def is_on_table(p_WB: Any) -> bool:
 def shift_scene(
     result: EpisodeResult, ends: Sequence[float], off_table: Iterable[str] = ()
 ) -> ShiftScene:
-    """Makes the line of a scene.
+    """Makes the record of a scene from its episode.
 
     Args:
         result: the result of the scene's episode.

@@ -397,7 +397,7 @@ def test_a_training_of_an_earlier_version_is_not_reused(queue: Pretending):
     path = queue.train(OURS.policy).with_name("summary.json")
     path.write_text(path.read_text().replace(f'"steps": {OURS.policy.steps}', '"steps": 7'))
     (failure,) = queue.run([OURS]).values()
-    assert failure == f"{path.parent}: steps is 7, not {OURS.policy.steps}: delete it"
+    assert f"steps is 7, not {OURS.policy.steps}" in failure
 
 
 def test_a_failed_command_is_reported_by_its_last_line_and_not_repeated(tmp_path: Path):
