@@ -18,9 +18,10 @@ from pydrake.multibody.tree import Frame, RigidBody
 from pydrake.systems.framework import Context
 
 _LEAST_RATE = 0.05
-"""If all joints are slower than this, nothing is corrected, in rad/s."""
+"""If all joints are slower than this, in rad/s, nothing is corrected."""
 _SAME_SPEED = 0.02
-"""A body moves with the hand if their velocities differ by less than this, in m/s, plus 5 %."""
+"""A body moves with the hand if their velocities differ by less than this, in m/s, plus 5 % of the
+hand's velocity."""
 
 
 class ArmPath:
@@ -44,7 +45,7 @@ class ArmPath:
         state: NDArray[np.float64],
         bodies: Sequence[RigidBody],
     ) -> None:
-        """Moves the bodies that the hand carries onto its arc. Call it once after each step.
+        """Moves the bodies that the hand carries onto the hand's arc. Call it once after each step.
 
         Args:
             plant: the plant, which must be discrete.
@@ -84,6 +85,6 @@ class ArmPath:
 
 
 def _rotation(vector: NDArray[np.float64]) -> RotationMatrix:
-    """The rotation about a vector by its length, in rad."""
+    """The rotation about a vector, by as many radians as the vector is long."""
     angle = float(np.linalg.norm(vector))
     return RotationMatrix(AngleAxis(angle, vector / angle)) if angle else RotationMatrix()

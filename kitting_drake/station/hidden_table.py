@@ -31,7 +31,7 @@ _BORDER = 0.015
 
 
 def hidden_table_note(scenario: Scenario) -> str | None:
-    """A warning if the waiting robot hides part of the workspace from a camera; else None.
+    """Returns a warning if the waiting robot hides part of the workspace from a camera; else None.
 
     Unless another camera sees the hidden part, it is a hole in o_t.
 
@@ -59,8 +59,8 @@ def _waiting_hand(home: tuple[float, float, float], along_y: list[float]) -> NDA
     """(n, 3) points of boxes around the hand, at all waiting positions, in the world, in metres.
 
     Args:
-        home: x, z and yaw.
-        along_y: where the hand may wait.
+        home: x, z and yaw of the home pose, in m and rad.
+        along_y: the values of y at which the hand may wait, in m.
     """
     palm = _box(PALM_SIZE, PALM_HEIGHT, FINGERTIP_DISTANCE)
     fingers = _box((FINGER_LENGTH, MAX_OPENING + 2 * FINGER_DEPTH), 0.0, PALM_HEIGHT)
@@ -81,7 +81,7 @@ def _box(size: tuple[float, float], low: float, high: float) -> NDArray[np.float
 
 
 def _waiting_arm(scenario: Scenario, robot: FrankaArm, along_y: list[float]) -> NDArray[np.float64]:
-    """(n, 3) points of an arm's links, likewise."""
+    """(n, 3) points of an arm's links, at all waiting positions, in the world, in metres."""
     motion = ArmMotion(
         scenario.planner,
         ARM_LIMITS[robot.model],

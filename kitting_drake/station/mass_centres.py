@@ -17,7 +17,7 @@ from pydrake.multibody.tree import RigidBody
 from pydrake.systems.framework import Context
 
 _LEAST_RATE = 0.02
-"""Rotations slower than this are not corrected, in rad/s."""
+"""Rotations slower than this, in rad/s, are not corrected."""
 
 
 def drift(

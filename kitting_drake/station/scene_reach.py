@@ -19,7 +19,8 @@ from systems.signals import PlanarPose, SurfaceHeights
 
 
 def check_scene_reach(scene: Scene, motion: RobotMotion, parameters: PickPlaceParameters) -> None:
-    """Raises an error if an arm cannot do anything in a scene. A floating hand reaches everything.
+    """Raises an error if an arm reaches no object or no goal of a scene. A floating hand reaches
+    all.
 
     If only some objects or goals are out of reach, there is no error here. Actions on them are
     refused during the episode.

@@ -300,7 +300,7 @@ class KittingStation(Diagram):
             diagram: the outermost Diagram, which contains this station; None if it is the station
                 itself.
             monitor: a function that is called after each step. Use it instead of
-                `Simulator.set_monitor`, which would prevent that objects appear and sleep.
+                `Simulator.set_monitor`, which would keep objects from appearing and sleeping.
 
         Raises:
             ValueError: `diagram` is None, but the station is part of a Diagram.
@@ -339,7 +339,7 @@ class KittingStation(Diagram):
                 self._arm_path.correct(self.plant, context, state, self._bodies)
 
     def _let_appear(self, root_context: Context) -> None:
-        """If an object is to appear, moves it to its place of appearance and wakes it."""
+        """Moves an object that is to appear now to its place on the table."""
         if self._feeder is None:
             return
         port = self._feeder.get_output_port()

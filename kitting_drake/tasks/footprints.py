@@ -113,8 +113,8 @@ class Placed:
         )
 
     def is_clear_of(self, other: Placed, spacing: float) -> bool:
-        """Whether the bodies are at least `spacing` metres apart and neither obstructs the hand at
-        the other."""
+        """Whether the bodies are at least `spacing` metres apart, and neither body obstructs the
+        hand at a grasp of the other."""
         return (
             _are_apart(self.body, other.body, spacing)
             and _are_apart(self.fingers, other.body, 0.0)

@@ -112,7 +112,7 @@ class Scene:
     affect neither the reward nor the expert."""
     laying_area: tuple[tuple[float, float], tuple[float, float]] | None = None
     """Lower and upper (x, y) corners, in metres, of the part of the table on which the expert may
-    lay objects that are in the way. None if objects lie apart, so that the expert never does so."""
+    lay objects that are in the way. None if objects lie apart, so that none is in the way."""
 
     def __post_init__(self) -> None:
         names = [item.name for item in self.objects] + [item.name for item in self.fixtures]
@@ -158,12 +158,12 @@ class ActionRecord:
     """Distance of the pick from the nearest of the object's annotated grasps, in mm; None if the
     object has no grasps."""
     pick_angle_error_deg: float | None
-    """Angle between the pick and that grasp, modulo half rotations: 0 to 90 degrees."""
+    """Angle between the pick and this nearest grasp, modulo half rotations: 0 to 90 degrees."""
     place_position_error_mm: float | None
     """Distance between the object's middle and its goal, in mm, if the object moved rigidly with
     the hand from pick to place; None if the object can fill no goal."""
     place_angle_error_deg: float | None
-    """Heading error after that motion, modulo the object's symmetry: 0 to 180 degrees."""
+    """Heading error after this rigid motion, modulo the object's symmetry: 0 to 180 degrees."""
     peak_force_n: PeakForce | None = None
     """The largest contact force during the action; None before a force is known."""
 
@@ -251,8 +251,8 @@ class TaskConfig:
 
 
 def last_action_on(name: str, records: Sequence[ActionRecord]) -> ActionRecord | str:
-    """The last action in which the hand held an object. If there is none, the cause of the
-    failure."""
+    """Returns the last action in which the hand held an object, or the cause of the failure if
+    there is none."""
     grasped = [item for item in records if item.outcome not in ("unfinished", "pressed")]
     own = [item for item in grasped if item.object == name]
     held = [item for item in own if item.outcome != "missed" and not _stopped_empty(item)]

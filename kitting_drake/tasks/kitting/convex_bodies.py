@@ -14,9 +14,9 @@ from kitting_drake.tasks.kitting.settling import ConvexBody
 _SLAB = 0.02
 """Largest thickness of the slabs along x into which a tool is cut, in metres."""
 _LEAST_VOLUME = 1e-9
-"""Pieces with a smaller volume are left out, in m^3."""
+"""Pieces with a volume below this, in m^3, are left out."""
 _THINNED_MM = 0.2
-"""Corners of pieces are moved by up to this to simplify the pieces, in mm."""
+"""To simplify pieces, their corners are moved by up to this, in mm."""
 _MASS = 0.1
 """The mass that is assumed for a tool without a mass, in kg. The resting pose hardly depends on
 it."""
@@ -26,7 +26,7 @@ def convex_body(tool: Tool) -> ConvexBody:
     """Cuts a tool into slabs along its length. Each connected part of a slab becomes a convex
     piece.
 
-    Pieces are convex hulls, so notches that are narrower than a slab is thick are filled.
+    Pieces are convex hulls, so notches narrower than the thickness of a slab are filled.
     """
     mesh = trimesh.Trimesh(
         tool.triangles.reshape(-1, 3), np.arange(3 * len(tool.triangles)).reshape(-1, 3)

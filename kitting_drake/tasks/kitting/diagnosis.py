@@ -25,14 +25,14 @@ REVERSED = "reversed"
 CAUSES = (MISSED_GRASP, SLIPPED, BLOCKED, WRONG_CAVITY, REVERSED, MISPLACED, NEVER_PICKED)
 
 _NEAR = 0.030
-"""A tool within this distance of a cavity counts as over it, in m. It is half the distance between
-two cavities."""
+"""A tool within this distance of a cavity, in m, counts as over the cavity. It is half the distance
+between two cavities."""
 _BORDER = 0.015
 """Width of the kit's border around the seated tools, in m."""
 _ALIGNED = math.radians(20.0)
 """Largest difference of heading, in radians, at which a tool counts as lying along a cavity."""
 _TILTED = math.radians(60.0)
-"""A tool tilted by more than this lies on the wrong side, in radians."""
+"""A tool tilted by more than this, in radians, lies on the wrong side."""
 
 
 def find_cause(
@@ -42,15 +42,15 @@ def find_cause(
     placement: Placement,
     records: Sequence[ActionRecord],
 ) -> str:
-    """The cause why a tool was not placed, one of `CAUSES`.
+    """Returns why a tool was not placed, one of `CAUSES`.
 
     - `never picked`: no action on the tool was completed.
     - `missed grasp`: no grasp of the tool held.
     - `reversed`: the tool is at its cavity, but rotated by 180 degrees or on the wrong side.
-    - `insertion blocked`: it is over its cavity, but protrudes or is displaced.
-    - `slipped`: it was lost on the way, or left outside the kit by a correct action.
-    - `wrong cavity`: it is over another tool's cavity.
-    - `misplaced`: it is anywhere else.
+    - `insertion blocked`: the tool is over its cavity, but protrudes or is displaced.
+    - `slipped`: the tool was lost on the way, or left outside the kit by a correct action.
+    - `wrong cavity`: the tool is over another tool's cavity.
+    - `misplaced`: the tool is anywhere else.
 
     Args:
         scene: the scene of the episode.

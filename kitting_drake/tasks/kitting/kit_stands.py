@@ -18,7 +18,7 @@ from systems.bounds import bounded
 
 MOST_TILT_DEG = 10.0
 MOST_RISER = 0.06
-"""Largest height of a riser, in metres. On a higher one, a kit could touch the palm when the hand
+"""Largest height of a riser, in metres. On a higher riser, a kit could touch the palm when the hand
 works at a neighbouring kit on the table."""
 
 _FILE = "riser.sdf"

@@ -149,16 +149,16 @@ class _DrawnKitting(KittingTask):
 
     @property
     def not_perturbed(self) -> tuple[str, ...]:  # type: ignore[override]
-        """Names of `--perturb` that do not apply: there are distractor boxes only if the tools lie
-        apart on the table."""
+        """Names of perturbations that do not apply: there are distractor boxes only if the tools
+        lie apart on the table."""
         return () if self.start == APART and not self.tray else ("distractors",)
 
     def _draw_scene(self, tools: list[Tool], grid: PixelGrid, seed: int) -> Scene:
         tools = self.fitted(self._weighted(tools, seed))
         if self.start != APART or self.tray:
             return self._draw_settled(self.kit_of(tools), tools, grid, seed)
-        # Use separate random streams, so that with one level kit the poses do not depend on these
-        # parameters.
+        # Use separate random streams, so that with one level kit the poses do not depend on the
+        # parameters of kits and risers.
         shares = self._shares(len(tools), np.random.default_rng([seed, 6]))
         kits = [self.kit_of([tools[index] for index in share]) for share in shares]
         stand_rng = np.random.default_rng([seed, 7])

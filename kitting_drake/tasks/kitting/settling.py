@@ -42,7 +42,7 @@ _SIZE_HINT = 2.0
 _BLOCK_FRICTION = CoulombFriction(0.3, 0.3)
 
 _CHECKS = 1 / 16
-"""Time between two checks for rest, in s; a multiple of both time steps."""
+"""Time between two checks for rest, in s; a multiple of the time step."""
 _STILL = 4
 """Bodies are at rest if they pass this many checks in a row, as in `RestDetector`. Velocities are
 not checked, because a flat body on a plane may chatter without changing its place."""
@@ -55,7 +55,7 @@ class ConvexBody:
     """A free body that consists of convex pieces, in its frame B and in SI units."""
 
     pieces: tuple[NDArray[np.float64], ...]
-    """For each piece, points (n, 3) whose convex hull it is."""
+    """For each piece, points (n, 3) of which the piece is the convex hull."""
     mass: float
     center_of_mass: NDArray[np.float64]
     inertia: NDArray[np.float64]

@@ -32,19 +32,19 @@ _POINTS = 1500
 """Number of points of a tool's surface that are used to check whether it is in the way of the
 hand."""
 _UPRIGHT = math.cos(math.radians(60.0))
-"""Cosine of a tilt. A tool tilted by more lies on another face than at first."""
+"""Cosine of the largest tilt at which a tool counts as lying on the same face as in its cavity."""
 _ON_KIT = 0.002
-"""A point at least this far inside the block's outline counts as on the kit, in metres."""
+"""A point at least this far inside the block's outline, in metres, counts as on the kit."""
 _NEAR_GRASP = 0.035
-"""Each of several touching tools, once the ones before it are taken away, must have a free grasp at
-most this far from its annotated one, in m."""
+"""Touching tools must be graspable one after another, each at a free grasp within this distance, in
+m, of its annotated grasp."""
 _LEANS = math.radians(5.0)
-"""A tool tilted by more than this counts as leaning, in radians."""
+"""A tool tilted by more than this, in radians, counts as leaning."""
 
 
 @dataclass(frozen=True)
 class Start:
-    """The poses at the start of an episode, at rest."""
+    """Poses of kit, tools and tray at the start of an episode, at rest."""
 
     X_WKit: RigidTransform
     X_WTools: tuple[RigidTransform, ...]

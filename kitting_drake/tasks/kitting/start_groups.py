@@ -1,5 +1,5 @@
-"""Draws groups of tools that touch, cross, lean on the kit or fall into a heap. They settle
-later."""
+"""Draws groups of tools that touch, cross, lean on the kit or fall into a heap, before they settle
+in a simulation."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -34,8 +34,8 @@ _HEAP_RADIUS = 0.05
 _HEAP_REACH = 0.12
 """A heap needs a free disc of this radius, in metres."""
 _HEAP_HEIGHT, _HEAP_STEP = 0.12, 0.03
-"""The lowest tool of a heap falls from the first height, in metres. Each further tool falls from
-higher by the second number."""
+"""The lowest tool of a heap falls from `_HEAP_HEIGHT`, in metres, and each further tool from
+`_HEAP_STEP` higher."""
 _HEAP_TILT = math.radians(15.0)
 """Largest roll and pitch of the tools of a heap before they fall, in radians."""
 
@@ -60,7 +60,7 @@ class Group:
 def start_groups(
     kit: Kit, tools: Sequence[Tool], kind: str, rng: np.random.Generator
 ) -> list[Group]:
-    """Draws the groups of a start. The first contains the kit.
+    """Draws the groups of a start. The first group contains the kit.
 
     Args:
         kit: the kit.

@@ -131,8 +131,7 @@ def draw_unsettled(
     spacing: float,
     rng: np.random.Generator,
 ) -> Start:
-    """Draws a start without a simulation. Its poses are those at rest only if the tools lie side by
-    side.
+    """Draws a start without a simulation. The tools are at rest only if they lie side by side.
 
     For the arguments see `draw_start`.
 

@@ -21,7 +21,7 @@ _GRASP_STREAM = 2
 them."""
 
 _UPRIGHT = math.cos(math.radians(20.0))
-"""Cosine of a tilt. An object that is tilted by more has toppled."""
+"""Cosine of the tilt above which an object counts as toppled."""
 
 
 def grasp_rng(seed: int) -> np.random.Generator:
