@@ -204,7 +204,7 @@ def _add_trace(benchmarks: Any) -> None:
         "--no-exif", action="store_true", help="draw photos that do not state their focal length"
     )
     tracing.add_argument(
-        "--keep", action="store_true", help="a folder in which to keep the photos and the pictures"
+        "--keep", action="store_true", help="keep the photos and pictures in the folder photos"
     )
     tracing.add_argument("--seed", type=int, default=0, help="seed of the photos (default: 0)")
 

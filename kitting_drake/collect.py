@@ -160,7 +160,7 @@ def _add_export_flags(parser: argparse.ArgumentParser) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class _Export:
-    """The export of frames: those of the demonstrations in `frames/`, and the dataset in
+    """The export of frames: each demonstration's frames in `frames/`, and the dataset in
     `lerobot/`."""
 
     folder: Path
@@ -263,7 +263,7 @@ def _task_in_words(chosen: ChosenScenario) -> str:
 def _run(
     workers: Workers, chosen: ChosenScenario, seed: int, log: Path | None, export: _Export | None
 ) -> Demonstration | Rejection | ProcessCrashed:
-    """Demonstrates in a worker; saves the frames of a demonstration."""
+    """Makes the demonstration of a seed in a worker. Saves its frames if they are exported."""
     recording = None if export is None else export.recording
     outcome = workers.run(_demonstrate, chosen, seed, log, recording)
     if isinstance(outcome, ProcessCrashed):

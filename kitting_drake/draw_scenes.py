@@ -47,7 +47,7 @@ _CATALOGUE = MODELS / "tools" / "catalogue.yaml"
 _DRAWN = ".drawn"
 """The suffix of the file that counts the scenes of an unfinished batch."""
 _POLL = 0.5
-"""The time between two readings of these files, in s."""
+"""The time between two readings of the `_DRAWN` files, in s."""
 _MOST_BATCHES = 10_000
 """The largest number of batches of a seed."""
 

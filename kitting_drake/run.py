@@ -155,10 +155,9 @@ def _check_files(picture: Path | None, video: Path | None, replay: Path) -> None
         raise UserError(f"--picture writes .png files, not '{picture}'")
     if video is not None and video.suffix not in (".gif", ".webp"):
         raise UserError(f"--video writes .gif and .webp files, not '{video}'")
-    # Check this before the episode.
     for path in (picture, video, replay):
         if path is not None and path.is_dir():
-            raise UserError(f"{path} is a folder")
+            raise UserError(f"{path} is a folder: name a file")
         if path is not None:
             require_folder(path.parent)
 

@@ -320,7 +320,7 @@ def _split(
     """Returns the training and the validation data."""
     everything = read_training_data(path)
     total = everything.count
-    # Use all data by default.
+    # By default, all data after the training data are for validation.
     most_kept = total if count is None else max(1, count // 10)
     if count is None:
         count = total if validation else _most_unrelated(everything, total - max(1, total // 11))

@@ -68,7 +68,7 @@ def prune(parent: Path) -> None:
     """Removes the least recently used folders in `parent`.
 
     It keeps the newest `KEPT_ENTRIES` folders, and all that are younger than `YOUNGEST_REMOVED`.
-    Scratch folders of killed processes are removed once they are older than that.
+    Scratch folders of killed processes are removed at the same age.
     """
     entries: list[tuple[float, Path]] = []
     for path in parent.iterdir():

@@ -55,8 +55,8 @@ def require_folder(path: Path) -> Path:
 
 
 def replace_folder(folder: Path, made: Path, aside: Path) -> None:
-    """Moves the existing `folder` to `aside`, and then `made` to `folder`. On failure both are
-    where they were.
+    """Moves the existing `folder` to `aside`, and then `made` to `folder`. If a move fails, both
+    folders stay where they were.
 
     Raises:
         OSError: moving fails.
@@ -89,7 +89,7 @@ def claim_folder(folder: Path, name: str, described: Any, *, of: str) -> None:
         folder: the folder.
         name: the name of the JSON file.
         described: the run's description, serializable as JSON.
-        of: the word for such a run in error messages.
+        of: what identifies a run, for error messages, such as `scenario or version`.
 
     Raises:
         UserError: the folder contains other files, or those of a different run.

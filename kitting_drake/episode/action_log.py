@@ -18,7 +18,7 @@ from systems.placement import Goal, PlacedObject, displacement, heading
 from systems.signals import PlanarPose, wrap_to_pi
 
 _LIFTED = 0.010
-"""An object that rises by at least this counts as lifted, in m."""
+"""An object that rises by at least this, in m, counts as lifted."""
 
 
 def nearest_object(station: KittingStation, poses: list[RigidTransform], pick: PlanarPose) -> int:

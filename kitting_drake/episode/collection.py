@@ -38,8 +38,8 @@ class Collection:
     """A folder with the demonstrations of the first seeds that are not rejected.
 
     The result does not depend on the number of workers or on interruptions. An unfinished
-    collection keeps one file for each seed in `parts`. They are merged into `demonstrations.h5` at
-    the end.
+    collection has one file for each seed in `parts`. These files are merged into
+    `demonstrations.h5` at the end.
     """
 
     def __init__(self, folder: Path, origin: Origin) -> None:
@@ -162,7 +162,7 @@ class Collection:
             for ending in (".h5", ".json"):
                 (self._parts / f"seed_{seed:08d}{ending}").unlink(missing_ok=True)
         with contextlib.suppress(OSError):
-            # An earlier run may have asked for more demonstrations.
+            # Parts may remain from an earlier run that asked for more demonstrations.
             self._parts.rmdir()
 
     def summary(self) -> str:

@@ -89,7 +89,7 @@ def is_right(reason: str, station: KittingStation, root_context: Context) -> boo
         root_context: the root context of the outermost Diagram, at the end.
 
     Returns:
-        Whether it is right; None for `interrupted`, and before the end.
+        Whether the reason is right; None for `interrupted`, and before the end.
     """
     if reason in _UNJUDGED:
         return None

@@ -41,7 +41,7 @@ def check_log(path: Path) -> None:
     """Checks, before the episode, that a log can be written to a file.
 
     Raises:
-        UserError: the file's suffix is not supported, or it is a folder.
+        UserError: the file's suffix is not supported, or the path is a folder.
         MachineError: a required package is not installed.
     """
     if path.suffix not in ENDINGS:

@@ -48,7 +48,7 @@ class FrameRecorder:
             pictures.append(encode_png(images[image_key(camera)]))
 
     def frames(self) -> EpisodeFrames:
-        """All frames so far. The action of the last one is the present command."""
+        """Returns all frames so far. The action of the last frame is the present command."""
         commands = np.array(self._commands)
         rewards = np.array([*self._rewards, self._rewards[-1]])
         return EpisodeFrames(

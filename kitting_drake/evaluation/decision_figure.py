@@ -33,7 +33,8 @@ _MOST_LETTERS = 150
 
 
 def draw_decision(observation: Observation, decision: Decision, *, title: str = "") -> bytes:
-    """Draws the observation with both gripper poses, and the three maps.
+    """Draws the observation with the gripper at pick and place, and the maps of pick, place and
+    angle.
 
     If the policy stops, no gripper is drawn, and the maps are those of the rejected action.
 
@@ -62,7 +63,7 @@ def draw_decision(observation: Observation, decision: Decision, *, title: str = 
 
 
 def draw_action(observation: Observation, action: PickPlaceAction, *, title: str = "") -> bytes:
-    """Draws the observation with both gripper poses, for a decision without maps.
+    """Draws the observation with the gripper at pick and place, for a decision without maps.
 
     Args:
         observation: the observation on which the decision is based.

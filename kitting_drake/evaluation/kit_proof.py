@@ -113,7 +113,7 @@ def prove_kit(folder: Path, episodes: int, progress: Progress) -> str:
 
     The policy is that of the kit's scenario. In each episode the tools lie elsewhere, and all
     cavities are wider or narrower by a common random error of `TOLERANCE_MM`. A kit that does not
-    fit is tried again with wider cavities, if the failures are such that these may help.
+    fit is tried again with wider cavities, if these may mend its failures.
 
     Args:
         folder: a folder that `hkd kit` wrote.

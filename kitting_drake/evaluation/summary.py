@@ -23,7 +23,8 @@ TIMED_OUT = "timed out"
 """The cause of all objects of an episode that timed out."""
 
 UNKNOWN = "unknown"
-"""If no other episode has objects, a failed episode counts as a single object of this category."""
+"""The category of the single object as which a failed episode counts if no other episode has
+objects."""
 
 AMBIGUITIES = {
     "protruding": ("height_error_mm", 1e3 * STRICT_HEIGHT),
@@ -127,7 +128,7 @@ def summarise(
 
 def _commits(episodes: Sequence[Episode]) -> str | None:
     """The commits of the code that ran the episodes. There are several if the evaluation was
-    resumed with other code. For episodes without a commit the present one is used."""
+    resumed with other code. If no episode has a commit, the present one is returned."""
     found = dict.fromkeys(str(episode["commit"]) for episode in episodes if episode.get("commit"))
     return ", ".join(found) or commit()
 
@@ -265,7 +266,7 @@ def _rates(
 
 def _measures(objects: Sequence[Entry]) -> dict[str, dict[str, Any]]:
     """The success rates by the task's other measures. An object without a recorded result is not a
-    success by any of them."""
+    success by any measure."""
     names = dict.fromkeys(name for item in objects for name in item.get("measures") or {})
     counts = {
         name: sum((item.get("measures") or {}).get(name, False) for item in objects)

@@ -48,7 +48,7 @@ def load_scenario(
         reason = getattr(error, "strerror", None) or "it is not a text file"
         raise UserError(f"cannot read the scenario {path}: {reason}") from error
     root = parse(content, str(path))
-    # By convention, such names hold YAML anchors and are not scenarios.
+    # Names with these beginnings hold YAML anchors by convention. They are not scenarios.
     names = [name for name in root if not name.startswith(("x-", "."))]
     fields = {item.name for item in dc.fields(Scenario)}
     if names and not set(names) - fields:
@@ -112,7 +112,8 @@ def _onto(raw: dict, defaults: Scenario) -> tuple[dict, Scenario]:
 def _without_mappings(given: dict, current: Task) -> Task:
     """Returns the task over which `given` is merged.
 
-    If `given` selects another type of task, it is that type's default, with empty mappings.
+    If `given` selects another type of task, it is the default task of that type. The mappings that
+    `given` replaces are empty in it.
     """
     for variant in typing.get_args(Task):
         if variant is PythonTask:

@@ -29,8 +29,8 @@ def load_own_task(raw: dict[str, Any], current: Task, base: Path) -> PythonTask:
 
     Args:
         raw: the parsed mapping `task:` of the scenario.
-        current: the present task. If it has the same class, `raw` is merged over it; otherwise it
-            is ignored.
+        current: the present task. If it has the same class, `raw` is merged over it; otherwise
+            `current` is ignored.
         base: the folder of the scenario's file.
 
     Raises:

@@ -111,7 +111,7 @@ def _applies(name: str, scenario: Scenario) -> bool:
 
 
 def _keep_worse(overlay: dict[str, Any], found: object) -> None:
-    """Replaces a number in `overlay` by the scenario's own where that is less perfect."""
+    """Replaces each number in `overlay` by the scenario's own number where this is less perfect."""
     for name, value in overlay.items():
         given = getattr(found, name)
         if isinstance(value, dict) and dc.is_dataclass(given):

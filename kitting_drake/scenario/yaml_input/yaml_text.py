@@ -65,7 +65,7 @@ def parse(content: str, where: str) -> dict:
     if root is None:
         return {}
     if not isinstance(root, dict):
-        raise UserError(f"{where} must be a mapping of names, not a {type(root).__name__}")
+        raise UserError(f"{where} must be a mapping of names to values")
     return root
 
 
