@@ -17,7 +17,7 @@ class PickHighest(LeafSystem):
 
     def __init__(self, kit_edge: float) -> None:
         super().__init__()
-        self._kit_edge = kit_edge  # World y, in m: the kit is on its near side.
+        self._kit_edge = kit_edge  # World y, in m; the kit is at smaller y.
         # Input ports are named after the station's output ports.
         self._seen = self.DeclareAbstractInputPort("observation_heights", Value(Observation()))
         self.DeclareAbstractOutputPort("action", lambda: Value(PickPlaceAction()), self._decide)

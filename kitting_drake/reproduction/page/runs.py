@@ -129,12 +129,12 @@ class Run:
     def label(self) -> str:
         """The policy, and the parameters that the paper varies, as text."""
         parts = [METHODS.get(self.method, self.method)]
+        examples = "scene" if self.method == "generalist" else "demonstration"
+        if str(self.detail("demonstrations")) != "1":
+            examples += "s"
         for key, text in (
             ("orientations", "N = {}"),
-            (
-                "demonstrations",
-                f"{{}} {'scenes' if self.method == 'generalist' else 'demonstrations'}",
-            ),
+            ("demonstrations", f"{{}} {examples}"),
             ("preset", "preset {}"),
         ):
             if self.detail(key) is not None:
