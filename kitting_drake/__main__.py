@@ -1,11 +1,11 @@
-"""The command `kitting-drake VERB ...`, or `python -m kitting_drake VERB ...`."""
+"""The command `kitting-drake COMMAND ...`, or `python -m kitting_drake COMMAND ...`."""
 
 import importlib
 import sys
 
 from kitting_drake import __version__
 
-VERBS = {
+COMMANDS = {
     "run": "run one episode, show it in Meshcat, save a replay",
     "evaluate": "run many seeds in parallel and summarise them",
     "collect": "collect demonstrations of the oracle in one file",
@@ -17,11 +17,11 @@ VERBS = {
     "results": "write the pages of results from the table of runs",
     "benchmark": "measure run times, recovery, agreement with MuJoCo, the paper's tables",
 }
-"""The verbs, with their help texts."""
+"""The commands, with their help texts."""
 
 
 def main() -> None:
-    """Runs the verb given on the command line, or lists the verbs, and exits."""
+    """Runs the command given as the first argument, or lists the commands, and exits."""
     arguments = sys.argv[1:]
     if arguments[:1] == ["--version"]:
         print(f"kitting_drake {__version__}")
@@ -29,17 +29,17 @@ def main() -> None:
     if not arguments or arguments[0] in ("-h", "--help"):
         print(_listing())
         sys.exit(0)
-    verb = arguments[0].replace("-", "_")
-    if verb not in VERBS:
+    command = arguments[0].replace("-", "_")
+    if command not in COMMANDS:
         print(
-            f"error: unknown verb '{arguments[0]}': use one of {', '.join(VERBS)}",
+            f"error: unknown command '{arguments[0]}': use one of {', '.join(COMMANDS)}",
             file=sys.stderr,
         )
         sys.exit(2)
-    name = f"kitting_drake.{verb}" + (".__main__" if verb == "hkd" else "")
+    name = f"kitting_drake.{command}" + (".__main__" if command == "hkd" else "")
     sys.argv = [f"kitting-drake {arguments[0]}", *arguments[1:]]
     try:
-        # Import only the modules that the verb needs.
+        # Import only the modules that the command needs.
         module = importlib.import_module(name)
         run_command = importlib.import_module("kitting_drake.common.command_line").run_command
     except KeyboardInterrupt:
@@ -48,10 +48,10 @@ def main() -> None:
 
 
 def _listing() -> str:
-    width = max(map(len, VERBS))
-    lines = [f"  {verb:<{width}}  {text}" for verb, text in VERBS.items()]
-    tail = "See kitting-drake VERB --help for its options."
-    return "\n".join(["usage: kitting-drake VERB ...", "", *lines, "", tail])
+    width = max(map(len, COMMANDS))
+    lines = [f"  {command:<{width}}  {text}" for command, text in COMMANDS.items()]
+    tail = "See kitting-drake COMMAND --help for its options."
+    return "\n".join(["usage: kitting-drake COMMAND ...", "", *lines, "", tail])
 
 
 if __name__ == "__main__":

@@ -96,7 +96,8 @@ def collision(
     obstacles: Sequence[Capsule] = (),
     held: float = 0.0,
 ) -> str:
-    """Names what the arm collides with at any of the given joint positions; empty if nothing.
+    """Names what the arm collides with at any of the given joint positions; empty if
+    it does not collide.
 
     Args:
         q: (n, 7) joint positions, in rad.

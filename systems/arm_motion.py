@@ -165,7 +165,7 @@ class ArmMotion(JawMotion):
 
     def _problem_on_the_ways(self, state: ArmState) -> str:
         """A sentence that names what the arm would touch on the planned motions; empty if
-        nothing."""
+        it touches nothing."""
         trial = self.view(np.array(state.vector))
         now = self._way(trial).at(math.inf)
         surface = float(state.clear_z) - self._parameters.travel_clearance

@@ -157,8 +157,8 @@ class HandMotion(JawMotion):
         state.duration = motion_duration(state.start, state.goal, rate, limits, delays, legs)
 
     def _set_legs(self, state: PlannerState, mode: Mode) -> None:
-        """Divides a motion down into legs: fast above all surfaces, then slower, and slowest where
-        contact is expected."""
+        """Divides a downward motion into legs: fast above all surfaces, then slower, and slowest
+        where contact is expected."""
         first, expected = guarded_marks(state, mode, self._parameters)
         marks = [float(state.start[Z])]
         for mark in (first, expected, float(state.goal[Z])):

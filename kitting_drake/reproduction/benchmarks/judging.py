@@ -37,7 +37,7 @@ def judge(action: PickPlaceAction, loose: Sequence[LooseTool]) -> str:
         loose: the tools that are not in their cavities yet.
 
     Returns:
-        `right`, or what is wrong: `no tool` (the action picks nothing that belongs into a cavity),
+        `right`, or what is wrong: `no tool` (the action picks nothing that belongs in a cavity),
             `grasp` (the hand cannot hold the tool there) or `place` (the place is wrong).
     """
     picked = _picked(action, loose)

@@ -234,7 +234,7 @@ def benchmark_recovery(
     """
     if not chosen.scenario.cameras:
         raise UserError(
-            f"{chosen.path}: cameras is empty, and the frames of episodes need at least one camera"
+            f"{chosen.path}: cameras is empty: the frames of episodes need at least one camera"
         )
     counts = {kind: _Count() for kind in Disturbance}
     strips: dict[Disturbance, _Strip] = {}

@@ -110,7 +110,7 @@ def drawn_case(
 ) -> tuple[PhotoSpec, PlacedTool]:
     """Draws the conditions of the k-th photo of a tool.
 
-    All photos together cover three heights and tilts, both grounds, and light from all sides.
+    All photos together cover three heights and tilts, both backgrounds, and light from all sides.
     """
     index += _SEEDS_APART * seed
     rng = np.random.default_rng(1000 + index)
@@ -252,7 +252,7 @@ def trace_table(measured: dict[str, Any]) -> Table:
     for name, key in (("all", "all"), ("those without a doubt", "undoubted")):
         if (errors := measured[key]) is not None:
             table.add_row(
-                f"{name}, mm: median, p95, p95 but for narrow gaps",
+                f"{name}, mm: median, p95, p95 without narrow gaps",
                 f"{errors['median_mm']:.2f}, {errors['p95_mm']:.2f}, "
                 f"{errors['gapless_p95_mm']:.2f}",
             )

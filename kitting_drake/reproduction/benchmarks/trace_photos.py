@@ -57,7 +57,7 @@ class PhotoSpec:
     roll: float = 0.0
     """The rotation about the line of sight, in degrees."""
     ground: str = "dark"
-    """The ground, a key of `GROUNDS`."""
+    """The background, a key of `GROUNDS`."""
     shadow: float = 0.5
     """The share of the light that a shadow takes away."""
     light: tuple[float, float] = (0.7, 0.4)

@@ -196,7 +196,8 @@ def _without(scenario: dict[str, Any], *more: str) -> dict[str, Any]:
 
 
 def has_unlimited_hand(scenario: Mapping[str, Any]) -> bool:
-    """Whether no contact force ended an action in runs of a scenario (see `described`)."""
+    """Whether a scenario (see `described`) has no limit on contact forces. This is so only in
+    runs of older versions."""
     planner = scenario.get("planner")
     return isinstance(planner, dict) and "force_limit" not in planner
 

@@ -313,7 +313,7 @@ class Cell:
             same = summary["policy_digest"] == _loaded(self).policy.digest(SCENARIOS / "paper")
             return None if same else "its weights are not those that come with the package"
         details = self._details(self.policy)
-        # Runs without the field avoid_failed_picks avoided failed picks; the page of results
+        # Runs that lack the field avoid_failed_picks did avoid failed picks. The page of results
         # estimates the effect.
         earlier = {"angle_only": False, "avoid_failed_picks": self.avoid_failed_picks}
         found = earlier | {"rotations": None} | summary["policy_details"]

@@ -165,7 +165,7 @@ def ravens_text(
 
 
 def fresh_tools(results: Sequence[Result], again: Collection[str] = ()) -> list[str]:
-    """Writes the section on the ten fresh tools; there is none without a result on them.
+    """Writes the section on the ten fresh tools; it is empty without results on them.
 
     Args:
         results: the results from `cell_results`.

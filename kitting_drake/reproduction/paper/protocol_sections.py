@@ -108,7 +108,7 @@ def _baselines() -> list[Training]:
 
 
 def _trainings(results: Mapping[str, Result], again: Collection[str]) -> list[str]:
-    """Writes the variation between trainings; nothing unless there is a second training."""
+    """Writes the variation between trainings; empty without a second training."""
     rows = []
     for task in FIGURE_6:
         for method in LEARNED[:2]:

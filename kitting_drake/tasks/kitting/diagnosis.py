@@ -1,4 +1,4 @@
-"""Finds the cause why a tool was not kitted, from true poses, which policies cannot see."""
+"""Finds out why a tool was not kitted, from true poses, which policies cannot see."""
 
 import math
 from collections.abc import Sequence

@@ -31,7 +31,7 @@ _GRASP_OFFSET = 0.01
 
 @dataclass
 class AlignBoxCorner(PoseTask):
-    """A box is put with one of its four corners into a marker."""
+    """A box is moved so that one of its four corners fits the corner of a marker."""
 
     # Range of the lengths of the box's horizontal edges, in m.
     box_sides: list[float] = bounded([0.03, 0.07], 0.01, 0.07)
