@@ -86,9 +86,7 @@ def main() -> int:
     with alone_in(folder):
         # Check this before claiming the folder.
         if not chosen.scenario.cameras:
-            raise UserError(
-                f"{chosen.path}: cameras is empty, and collect needs at least one camera"
-            )
+            raise UserError(f"{chosen.path}: cameras is empty: collect needs at least one camera")
         require_rendering()
         build_any_chosen(chosen, seeds_from(arguments.seed))
         export = _Export.of(arguments, chosen, folder) if arguments.export else None

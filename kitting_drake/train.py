@@ -272,7 +272,7 @@ def _add_settings(parser: argparse.ArgumentParser) -> None:
         type=count_type,
         metavar="N",
         help="for the transporter: the number of rotations of the crop in a training step; half "
-        "as many of the scene are used (default: the label's and four more, the minimum)",
+        "as many of the scene are used (default: the minimum: the label's and four others)",
     )
     parser.add_argument("--steps", type=count_type, default=10_000, help="(10000)")
     parser.add_argument(

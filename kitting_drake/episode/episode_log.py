@@ -47,7 +47,7 @@ def check_log(path: Path) -> None:
     if path.suffix not in ENDINGS:
         raise UserError(f"--log writes {' and '.join(ENDINGS)} files, not '{path}'")
     if path.is_dir():
-        raise UserError(f"--log: {path} is a folder; name a file")
+        raise UserError(f"--log: {path} is a folder: name a file")
     if path.suffix == ".mcap":
         _mcap_package()
 
