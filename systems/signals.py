@@ -122,6 +122,11 @@ class Observation:
 
 _FILL_REACH = 25
 """A hole is filled from neighbours at most this far away, in pixels."""
+_SMALL_HOLE = 4
+"""All of a hole of at most this many pixels gets the height of its lowest neighbour."""
+_HIDDEN_BELOW = 0.005
+"""A neighbour of a hole that is higher than this above the hole's lowest neighbours may be what
+hides the hole, in metres."""
 
 
 def fill_unseen(
@@ -131,9 +136,9 @@ def fill_unseen(
 ) -> NDArray[np.float32]:
     """Fills the heights of unseen pixels.
 
-    A hidden surface is lower than the surface that hides it, so a hole is filled with the lowest
-    neighbour, from its border inwards. Pixels outside all views, or deep in a large hole, get the
-    table's height, zero, because nothing is known about them.
+    A hidden surface is lower than the surface that hides it. So a pixel of a hole gets the height
+    of the nearest seen pixel among the lowest ones around the hole. Pixels outside all views, or
+    deep in a large hole, get the table's height, zero, because nothing is known about them.
 
     Args:
         height: (rows, cols), in metres above the table.
@@ -145,16 +150,27 @@ def fill_unseen(
     # Import SciPy lazily.
     from scipy import ndimage
 
-    filled = np.where(valid, height, np.inf).astype(np.float32)
     holes = ~valid if in_view is None else ~valid & in_view
-    missing = holes
-    for _ in range(_FILL_REACH):
-        if not missing.any():
-            break
-        lowest = ndimage.minimum_filter(filled, size=3, mode="nearest")
-        filled = np.where(missing, lowest, filled)
-        missing = holes & ~np.isfinite(filled)
-    return np.where(np.isfinite(filled), filled, np.float32(0))
+    labels, count = ndimage.label(holes, np.ones((3, 3), bool))
+    seen = np.where(valid, height, np.inf)
+    beside = ndimage.minimum_filter(seen, size=3, mode="nearest")
+    lowest = np.full(count + 1, np.inf)
+    np.minimum.at(lowest, labels, beside)
+    filled = np.where(valid, height, np.where(holes, lowest[labels], 0.0))
+    sizes = np.bincount(labels.ravel())
+    for label, place in enumerate(ndimage.find_objects(labels), 1):
+        if sizes[label] <= _SMALL_HOLE:
+            continue
+        rows, cols = (slice(max(part.start - 1, 0), part.stop + 1) for part in place)
+        hole = labels[rows, cols] == label
+        around = seen[rows, cols]
+        low = ndimage.binary_dilation(hole, np.ones((3, 3), bool)) & (
+            around <= lowest[label] + _HIDDEN_BELOW
+        )
+        away, nearest = ndimage.distance_transform_edt(~low, return_indices=True)
+        heights = np.where(away <= _FILL_REACH, around[tuple(nearest)], 0.0)
+        filled[rows, cols][hole] = heights[hole]
+    return np.where(np.isfinite(filled), filled, 0.0).astype(np.float32)
 
 
 @dataclass(frozen=True)

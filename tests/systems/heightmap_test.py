@@ -91,6 +91,17 @@ def test_what_no_camera_sees_is_not_filled_from_its_border():
     assert not fill_unseen(height, valid)[:, 56:].any()
 
 
+def test_the_shadow_of_an_object_is_table():
+    height = np.zeros((30, 40), np.float32)
+    height[10:20, 10:20] = 0.02
+    valid = np.ones(height.shape, bool)
+    valid[10:20, 20:26] = False  # The shadow, as wide as six pixels.
+    valid[14:16, 13:15] = False  # Pixels without depth on top of the object.
+    filled = fill_unseen(np.where(valid, height, 0), valid)
+    assert not filled[10:20, 20:26].any()
+    np.testing.assert_array_equal(filled[14:16, 13:15], np.float32(0.02))
+
+
 def test_the_default_is_that_everything_is_in_view():
     seen = Observation(np.zeros((4, 8, 9), np.float32), PixelGrid(rows=8, cols=9))
     assert seen.in_view.all() and not seen.valid.any()
