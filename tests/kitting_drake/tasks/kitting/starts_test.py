@@ -1,5 +1,6 @@
 import itertools
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from kitting_drake.tasks import Kitting, ToolsetKitting
 from kitting_drake.tasks.kitting import settling, starts
 from kitting_drake.tasks.kitting.convex_bodies import convex_body
 from kitting_drake.tasks.kitting.start_checks import FACES
-from kitting_drake.tasks.kitting.start_groups import START_KINDS, projected
+from kitting_drake.tasks.kitting.start_groups import START_KINDS, _lean, projected
 from kitting_drake.tasks.kitting.starts import TRAY_SIZE
 from kitting_drake.tasks.task import Scene
 from systems.cluttered_table import tilt
@@ -69,6 +70,12 @@ def test_a_leaning_tool_rests_on_the_block():
     top = float(leaning.X_WB.multiply(leaning.p_BPoints.T)[2].max())
     assert top > 0.05
     assert kit.p_FPoints is not None
+
+
+def test_a_part_shorter_than_the_overhang_leans_too():
+    kit, part = SimpleNamespace(size=(0.2, 0.2, 0.04)), SimpleNamespace(length=0.009)
+    poses = [_lean(kit, part, side, np.random.default_rng(side)) for side in range(4)]
+    assert all(tilt(X_KT) > 0.5 for X_KT in poses)
 
 
 def test_a_tool_settles_as_convex_pieces():
