@@ -38,6 +38,8 @@ def text_of(document: Any) -> str:
 
 
 def svg_path(loop: NDArray[np.float64]) -> str:
-    """Returns the `d` attribute of an SVG path through points (n, 2) in mm, with y pointing
-    down."""
+    """Returns the `d` attribute of a closed SVG path through points (n, 2) in mm.
+
+    As in SVG, the y axis points down.
+    """
     return "M " + " L ".join(f"{x:.4f} {y:.4f}" for x, y in loop) + " Z"

@@ -20,13 +20,16 @@ from kitting_drake.hkd.kits.layout import kit_cavities
 from kitting_drake.hkd.kits.parameters import KitParameters
 
 TEST_HOLE_MM = 20.0
-"""The side of the hole of `test_piece`."""
+"""The side of the square hole in `test_piece`, in mm."""
 _ABOVE = 0.01
-"""How far the cutters stick out of the block, in metres, so that no thin skin remains."""
+"""How far the solids that are subtracted stick out of the block, in metres.
+
+Without this, rounding could leave a thin skin at the block's top.
+"""
 _FINEST = 2e-6
 """The size of the smallest detail that the solid keeps, in metres."""
 _DIGITS = 4
-"""Decimals of coordinates in files, in millimetres."""
+"""The number of decimals of coordinates in files, where the unit is 1 mm."""
 
 
 @dataclass(frozen=True)
@@ -36,13 +39,13 @@ class Design:
     kit: Kit
     cavities: tuple[Cavity, ...]
     recesses: tuple[Recess, ...]
-    """All recesses: first the cavities, in the tools' order."""
+    """All recesses: first the cavities in the tools' order, then the notches and labels."""
     notes: tuple[str, ...]
-    """A sentence on each notch or label that found no room."""
+    """A sentence for each tool whose notches or label found no room."""
     compensation: float = 0.0
     """How much wider the cavities are than those of `kit`, on each side, in metres."""
     outside: Outside = field(default_factory=Outside)
-    """The shape of the block's outside; only the solids have it."""
+    """The shape of the block's outside. It changes the solid, but not the drawings."""
 
     @property
     def size_mm(self) -> tuple[float, float, float]:
@@ -63,12 +66,12 @@ def design_kit(
     compensation: float = 0.0,
     outside: Outside | None = None,
 ) -> Design:
-    """Designs the block of a kit, with notches and labels on request where they fit.
+    """Designs the block of a kit.
 
     Args:
         kit: the simulated kit.
-        notches: whether to add finger notches.
-        labels: whether to engrave the tools' names.
+        notches: whether to add finger notches where they fit.
+        labels: whether to engrave the tools' names where they fit.
         compensation: see `Design.compensation`.
         outside: see `Design.outside`.
     """
@@ -111,7 +114,7 @@ def solid(design: Design) -> Manifold:
 
 
 def surface(solid: Manifold) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Returns the surface of a solid, with coordinates rounded as in files.
+    """Returns the surface of a solid, with coordinates rounded to `_DIGITS` decimals.
 
     Returns:
         Vertices (n, 3) in millimetres and triangles (m, 3). The surface is watertight, and its
@@ -126,7 +129,7 @@ def surface(solid: Manifold) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
 
 
 def openings(design: Design) -> list[Opening]:
-    """Returns what is cut into the block from above, in the frame of the files."""
+    """Returns the cavities, notches and labels of a block, in the frame of the files in mm."""
     parameters, raised = design.kit.parameters, design.outside.raised_mm
 
     def loops(outline: CrossSection) -> CrossSection:
@@ -145,14 +148,10 @@ def openings(design: Design) -> list[Opening]:
 
 
 def test_piece() -> Manifold:
-    """Returns a small plate with a square hole, to measure how much too small a printer makes
-    holes. In mm.
+    """Returns a small plate with a square hole, in mm. It shows how much a printer shrinks holes.
 
     The side of the designed hole is `TEST_HOLE_MM`. The compensation to use is half the difference
-    between this and the side of the printed hole.
-
-    Returns:
-        The vertices and triangles, as in `solid`.
+    between `TEST_HOLE_MM` and the side of the printed hole.
     """
     hole = TEST_HOLE_MM
     plate = Manifold.cube((hole + 12.0, hole + 12.0, 8.0))
@@ -169,13 +168,12 @@ def in_block(points: NDArray[np.float64], parameters: KitParameters) -> NDArray[
 
 
 def loops_mm(outline: CrossSection, parameters: KitParameters) -> list[NDArray[np.float64]]:
-    """Returns the closed loops (n, 2) of an outline in mm, converted from the kit frame by
-    `in_block`."""
+    """Converts an outline in the kit frame to closed loops (n, 2), as `in_block` does."""
     return [in_block(np.asarray(loop), parameters) for loop in outline.to_polygons()]
 
 
 def layers(design: Design) -> dict[tuple[str, float], list[Recess]]:
-    """Groups the recesses by kind and depth in mm, in drawing order."""
+    """Groups the recesses by (kind, depth in mm), in drawing order."""
     groups: dict[tuple[str, float], list[Recess]] = {}
     for recess in design.recesses:
         groups.setdefault((recess.kind, design.depth_mm(recess)), []).append(recess)

@@ -51,8 +51,10 @@ def dxf_text(design: Design) -> str:
 
 
 def svg_text(design: Design) -> str:
-    """Draws the recesses as an SVG in units of 1 mm, with a group per depth and a path per
-    recess."""
+    """Draws the recesses as an SVG in units of 1 mm.
+
+    There is one group for each kind and depth, and in it one path for each recess.
+    """
     length, width, height = design.size_mm
     lines = [
         '<?xml version="1.0" encoding="UTF-8"?>',
@@ -84,8 +86,6 @@ def _block(design: Design) -> NDArray[np.float64]:
 
 
 def _path(loop: NDArray[np.float64], width: float) -> str:
-    """Returns the SVG path of a closed loop (n, 2) on a block of the given width, both in mm.
-
-    The y axis is flipped, because it points down in SVG.
-    """
+    """Returns the SVG path of a closed loop (n, 2) on a block of the given width, both in mm."""
+    # The y axis points down in SVG.
     return svg_path(np.column_stack([loop[:, 0], width - loop[:, 1]]))

@@ -1,4 +1,4 @@
-"""Writes all files of a kit into one folder, which appears atomically (`hkd kit`)."""
+"""Writes all files of a kit into one folder (`hkd kit`). The folder appears atomically."""
 
 import dataclasses
 import json
@@ -68,16 +68,16 @@ Kit:
 
 @dataclass(frozen=True)
 class KitFiles:
-    """What `export_kit` made."""
+    """The results of `export_kit`."""
 
     design: Design
     block: Manifold
     """The block in the frame of the files, in mm."""
     split: Split | None
-    """The pieces; None: the block is whole."""
+    """The pieces of the block. None: the block is not split."""
     sheet: FoamSheet | None
     notes: tuple[str, ...]
-    """What found no room or cannot be printed, in sentences."""
+    """A sentence for each thing that found no room or cannot be printed."""
 
 
 def export_kit(request: KitRequest) -> KitFiles:
@@ -145,10 +145,10 @@ def _made(request: KitRequest, kit: Kit, others: Sequence[SheetKit]) -> KitFiles
 
 
 def _check_replaceable(folder: Path) -> None:
-    """Raises UserError unless the folder is missing or holds only a kit's files."""
+    """Raises UserError unless the folder is missing, is empty or holds only a kit's files."""
     if not folder.exists():
         return
-    advice = "give another --output, or delete it"
+    advice = f"give another --output, or delete {folder}"
     if not folder.is_dir():
         raise UserError(f"{folder} is a file: {advice}")
     present = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
@@ -194,7 +194,7 @@ def _write(folder: Path, made: KitFiles, parameters: KitParameters, robot: str) 
 
 
 def _write_solid(stem: Path, solid: Manifold, title: str) -> None:
-    """Writes a solid in mm as STL and 3MF."""
+    """Writes a solid in mm to `stem` with the suffixes .stl and .3mf."""
     triangles = surface(solid)
     stl = stl_bytes(triangles)
     _check_closed(stl)
@@ -212,7 +212,11 @@ def _check_closed(stl: bytes) -> None:
 
 
 def _bring_tools(tools: Sequence[Tool], folder: Path) -> list[str]:
-    """Copies the user's tools into `tools/` and returns the scenario's name of every tool."""
+    """Copies the user's own tools into `folder/tools/`.
+
+    Returns:
+        For each tool, its name in the kit's scenario: a name, or the path of the copy.
+    """
     names: dict[Path, str] = {}
     for tool in tools:
         if tool.directory in names:
@@ -267,7 +271,7 @@ def _record(design: Design, names: Sequence[str]) -> dict[str, Any]:
 
 
 def _parts_record(made: KitFiles) -> dict[str, Any]:
-    """The pieces and the sheet of a kit, in mm, for JSON."""
+    """Returns the entries of `kit.json` on the pieces and the sheet, in mm."""
     record: dict[str, Any] = {}
     if made.split is not None:
         record["pieces"] = [

@@ -1,4 +1,4 @@
-"""Fills a foam sheet or a drawer with kits, and draws it in true millimetres."""
+"""Fills a foam sheet or a drawer with kits, and draws it in millimetres."""
 
 import io
 import itertools
@@ -22,7 +22,7 @@ MOST_KITS = 60
 """The largest number of kits on a sheet."""
 
 _MIXTURES = 40
-"""How many mixtures of upright and turned copies are tried."""
+"""The number of random choices of which copies are turned that are tried."""
 _SHEET, _BLOCK = "SHEET", "BLOCK"
 _STROKES = ("#0b5fa5", "#2b8a3e", "#9c36b5", "#d9480f", "#087f5b", "#a61e4d", "#5f3dc4")
 _COLOURS = (4, 3, 6, 30, 2, 1, 150, 80)
@@ -34,11 +34,11 @@ class SheetKit:
 
     name: str
     size: tuple[float, float]
-    """Length and width of its block, in mm."""
+    """The length and width of the kit's block, in mm."""
     height: float
     """The height of the kit's block, in mm."""
     layers: dict[str, list[NDArray[np.float64]]]
-    """Closed loops (n, 2) in mm by layer; the origin is the block's lower left corner."""
+    """The closed loops (n, 2) in mm of each layer; the origin is the block's lower left corner."""
 
 
 @dataclass(frozen=True)
@@ -48,8 +48,9 @@ class KitPlace:
     kit: int
     """The index of the kit in `FoamSheet.kits`."""
     x: float
-    """`x` and `y` are the position of the block's lower left corner, in mm."""
+    """The x of the block's lower left corner on the sheet, in mm."""
     y: float
+    """The y of the block's lower left corner on the sheet, in mm."""
     turned: bool
     """Whether the kit is turned by 90 degrees, counter-clockwise."""
 
@@ -59,6 +60,7 @@ class FoamSheet:
     """A sheet with kits."""
 
     size: tuple[float, float]
+    """The length and width of the sheet, in mm."""
     margin: float
     """The least distance of a block from the sheet's edge, in mm."""
     gap: float
@@ -70,10 +72,15 @@ class FoamSheet:
 
 
 def kit_of_dxf(name: str, text: str, height: float) -> SheetKit:
-    """A kit from the text of its `cavities.dxf`.
+    """Reads a kit from the text of its `cavities.dxf`.
+
+    Args:
+        name: the kit's name.
+        text: the content of the file.
+        height: the height of the kit's block, in mm.
 
     Raises:
-        UserError: the text is no drawing of `hkd kit`.
+        UserError: `hkd kit` cannot have written the text.
         MachineError: ezdxf is not installed.
     """
     ezdxf = import_extra("ezdxf", purpose="DXF", extra="fabrication")
@@ -83,13 +90,13 @@ def kit_of_dxf(name: str, text: str, height: float) -> SheetKit:
             layers.setdefault(line.dxf.layer, []).append(np.array(line.get_points("xy")))
         (block,) = layers[_BLOCK]
     except (ezdxf.DXFError, KeyError, ValueError) as error:
-        raise UserError(f"'{name}': its cavities.dxf is damaged: make the kit again") from error
+        raise UserError(f"the cavities.dxf of '{name}' is damaged: make the kit again") from error
     length, width = block.max(axis=0)
     return SheetKit(name, (float(length), float(width)), height, layers)
 
 
 def kit_of_folder(folder: Path) -> SheetKit:
-    """A kit that `hkd kit` wrote before.
+    """Reads a kit from the folder that `hkd kit` wrote.
 
     Raises:
         UserError: the folder has no kit.
@@ -99,7 +106,10 @@ def kit_of_folder(folder: Path) -> SheetKit:
         height = float(record["block"][2])
         text = (folder / "cavities.dxf").read_text()
     except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
-        raise UserError(f"{folder} is not a folder that `hkd kit` wrote") from error
+        raise UserError(
+            f"{folder} is not a folder that `hkd kit` wrote: its kit.json or cavities.dxf is "
+            "missing or damaged"
+        ) from error
     return kit_of_dxf(folder.name, text, height)
 
 
@@ -110,14 +120,14 @@ def fill_sheet(
     kits: Sequence[SheetKit],
     copies: int | None,
 ) -> FoamSheet:
-    """Places kits on a sheet, turned by 90 degrees where that helps.
+    """Places kits on a sheet, each as it is or turned by 90 degrees.
 
     Args:
         size: the sheet's sides, in mm.
         margin: see `FoamSheet`.
         gap: see `FoamSheet`.
-        kits: at least one.
-        copies: how many of each; None: as many as find room, one of each in turn.
+        kits: the kits to place, at least one.
+        copies: the number of copies of each kit; None: copies are added until no more fit.
 
     Raises:
         UserError: a kit is larger than the sheet.
@@ -128,7 +138,7 @@ def fill_sheet(
             block, given = (f"{a:g} by {b:g} mm" for a, b in (kit.size, size))
             raise UserError(
                 f"'{kit.name}' of {block} does not fit on a sheet of {given} with margins of "
-                f"{margin:g} mm"
+                f"{margin:g} mm: give a larger --sheet or a smaller --margin_mm"
             )
     best: list[KitPlace] = []
     for places in _packings(room, gap, kits, copies):
@@ -152,8 +162,7 @@ def fill_sheet(
 
 
 def _merit(places: Sequence[KitPlace], kits: Sequence[SheetKit]) -> tuple[int, float]:
-    """Rates a packing: first by the number of different kits on the sheet, then by the area that
-    their blocks cover."""
+    """Returns what a better packing has more of: different kits on the sheet, then covered area."""
     present = len({place.kit for place in places})
     return present, sum(math.prod(kits[place.kit].size) for place in places)
 
@@ -161,7 +170,7 @@ def _merit(places: Sequence[KitPlace], kits: Sequence[SheetKit]) -> tuple[int, f
 def _packings(
     room: tuple[float, float], gap: float, kits: Sequence[SheetKit], copies: int | None
 ) -> Iterator[list[KitPlace]]:
-    """Yields the packings from which the best one is chosen."""
+    """Yields packings of kits, from which the best one can be chosen."""
     areas = [math.prod(kit.size) for kit in kits]
     largest_first = sorted(range(len(kits)), key=lambda i: -areas[i])
     most = MOST_KITS if copies is None else copies * len(kits)
@@ -171,7 +180,8 @@ def _packings(
     if len(kits) == 1:
         count = min(len(order), int(room[0] * room[1] / areas[0]) + 1)
         order = order[:count]
-        # Some copies one way, the rest the other way; then mixtures, as in a pinwheel.
+        # Turn only the first or only the last copies. Then choose the turned copies at random,
+        # which can find a pinwheel.
         for first, number in itertools.product((False, True), range(count + 1)):
             patterns.append([first] * number + [not first] * (count - number))
         mixtures = np.random.default_rng(0).random((_MIXTURES, count)) < 0.5
@@ -188,9 +198,15 @@ def _packed(
     turned: Sequence[bool] | None,
     by_rows: bool,
 ) -> list[KitPlace]:
-    """Places the kits in order, each as low as possible (by rows) or as far left as possible.
+    """Places kits on a sheet one after the other, and leaves out those that find no room.
 
-    A kit for which there is no room is left out.
+    Args:
+        room: the sides of the sheet without its margins, in mm.
+        gap: the least distance between two blocks, in mm.
+        kits: the kits.
+        order: the indices of the kits to place.
+        turned: whether each kit in `order` is turned; None: as it fits best.
+        by_rows: whether to place each kit as low as possible, or else as far left as possible.
     """
     places: list[KitPlace] = []
     boxes = np.empty((0, 4))
@@ -223,7 +239,18 @@ def _free_corner(
     sides: NDArray[np.float64],
     by_rows: bool,
 ) -> NDArray[np.float64] | None:
-    """The lowest (leftmost) place of a rectangle among others, or None."""
+    """Finds the lowest (if `by_rows`) or leftmost place for a rectangle.
+
+    Args:
+        room: the sides of the area that may be used, in mm.
+        gap: the least distance from other rectangles, in mm.
+        boxes: the placed rectangles (n, 4) as x_min, y_min, x_max, y_max, in mm.
+        sides: the sides (2) of the rectangle to place, in mm.
+        by_rows: whether to look for the lowest place.
+
+    Returns:
+        The lower left corner (2) in mm, or None if there is no room.
+    """
     xs = np.concatenate([[0.0], boxes[:, 2] + gap])
     ys = np.concatenate([[0.0], boxes[:, 3] + gap])
     x, y = (axis.ravel() for axis in np.meshgrid(xs, ys))
@@ -245,7 +272,10 @@ def _free_corner(
 
 
 def sheet_layers(sheet: FoamSheet) -> dict[str, list[NDArray[np.float64]]]:
-    """The closed loops (n, 2) of a sheet in mm by layer: SHEET, BLOCK, then one for each depth."""
+    """Returns the closed loops (n, 2) in mm of each layer of a sheet.
+
+    The first layers are SHEET and BLOCK. There is one more for each kind and depth of recess.
+    """
     length, width = sheet.size
     layers = {_SHEET: [np.array([(0, 0), (length, 0), (length, width), (0, width)], dtype=float)]}
     layers[_BLOCK] = []
@@ -271,7 +301,7 @@ def _depth_order(name: str) -> tuple[str, float]:
 
 
 def sheet_dxf(sheet: FoamSheet) -> str:
-    """A DXF of the sheet, with the layers of `sheet_layers`."""
+    """Draws a sheet as a DXF, with the layers of `sheet_layers`."""
     document: Any = new_dxf()
     length, width = sheet.size
     for number, (name, loops) in enumerate(sheet_layers(sheet).items()):
@@ -283,7 +313,7 @@ def sheet_dxf(sheet: FoamSheet) -> str:
 
 
 def sheet_svg(sheet: FoamSheet) -> str:
-    """An SVG of the sheet with 1 mm user units and a group for each of its layers."""
+    """Draws a sheet as an SVG in units of 1 mm, with a group for each layer of `sheet_layers`."""
     length, width = sheet.size
     names = ", ".join(dict.fromkeys(sheet.kits[place.kit].name for place in sheet.places))
     lines = [

@@ -1,4 +1,4 @@
-"""What `hkd kit` is asked for: its command line, the request, and the kit's parameters."""
+"""The command line of `hkd kit`, and the kit's parameters that follow from it."""
 
 import argparse
 import dataclasses
@@ -15,12 +15,12 @@ from kitting_drake.hkd.kits.parameters import KitParameters
 from kitting_drake.hkd.tools.tool import Tool
 
 FITS = {"snug": 0.15, "easy": 0.35, "loose": 0.75}
-"""Named clearances between a tool and the wall, on each side, in mm."""
+"""The named clearances between a tool and its cavity's wall, on each side, in mm."""
 
 _WIDEST_MM = 10.0
 """The largest clearance, in mm."""
 _LONGEST_MM = 1000.0
-"""The longest side of a block of given size, in mm."""
+"""The largest length or width that can be given for a block, in mm."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class SheetRequest:
     margin_mm: float = 10.0
     gap_mm: float = 5.0
     copies: int | None = None
-    """How many of each kit. None: as many as find room."""
+    """The number of copies of each kit. None: as many as fit."""
     others: tuple[Path, ...] = ()
     """Folders of other kits that are placed on the same sheet."""
 
@@ -46,29 +46,37 @@ class KitRequest:
     clearance_mm: float | None = None
     """The clearance between a tool and its cavity's wall. None: the template's 2 mm."""
     compensate_mm: float = 0.0
-    """How much too narrow the printer or router makes cavities, on each side. The cavities in the
-    files to print and cut are wider by this; those of the simulated kit are not."""
+    """How much too narrow the printer or router makes cavities, on each side.
+
+    The cavities in the files to print and cut are wider by this amount. The cavities of the
+    simulated kit are not.
+    """
     lead_in_mm: float | None = None
     """The width of the bevel around the rims. None: the template's 1 mm."""
     fit_of: tuple[tuple[str, float], ...] = ()
-    """Pairs of a tool's name or path and its own clearance, in mm, instead of `clearance_mm`."""
+    """Pairs of a tool's name or path, and the clearance of this tool instead of `clearance_mm`."""
     stand_out_mm: float = 0.0
-    """By how much the tops of the tools stand out of the block."""
+    """The height of the tools' tops above the block's top."""
     wall_mm: float | None = None
+    """The wall between and around the cavities. None: the template's 6 mm."""
     block_mm: tuple[float, float, float] | None = None
-    """The block's length, width and height. None: the smallest block found, with the template's
-    height."""
+    """The block's length, width and height.
+
+    None: the smallest length and width that are found, and the template's height.
+    """
     notches: bool = False
     labels: bool = False
     chamfer_mm: float = 0.0
-    """The bevel of the block's outer edges."""
+    """The width of the bevel along the block's outer edges."""
     gridfinity: bool = False
     """Whether the block gets sides and feet for Gridfinity's grid."""
     nozzle_mm: float = 0.4
     """The width of the printer's nozzle. Walls that are thinner are reported."""
     bed_mm: tuple[float, float] | None = None
-    """The sides of the printer's bed. A larger block is split into pieces that fit it. None: the
-    block is not split."""
+    """The sides of the printer's bed. None: the block is not split.
+
+    A block that is larger than the bed is split into pieces that fit the bed.
+    """
     joint_play_mm: float = 0.1
     """The gap between a dovetail and its socket, on each side."""
     sheet: SheetRequest | None = None
@@ -103,18 +111,22 @@ def check_request(request: KitRequest) -> None:
                 )
     most = (request.wall_mm or 1e3 * KitParameters().nested_wall) / 2
     if request.chamfer_mm > most:
-        raise UserError(f"--chamfer_mm {request.chamfer_mm:g} is more than half of the wall")
+        raise UserError(
+            f"--chamfer_mm {request.chamfer_mm:g} is more than half of the wall: give at most "
+            f"{most:g}"
+        )
 
 
 def kit_parameters(request: KitRequest, loaded: Mapping[str, Tool]) -> KitParameters:
-    """The parameters of a kit.
+    """Returns the parameters of a requested kit.
 
     Args:
         request: the request.
-        loaded: its tools by the names in it.
+        loaded: the request's tools, by the names in the request.
 
     Raises:
-        UserError: the fit of a tool is wrong, or the tools do not fit on a block.
+        UserError: `fit_of` is invalid, or the block's sides are not on Gridfinity's grid, or the
+            tools do not fit on any block.
     """
     parameters = _lengths(request)
     parameters.clearance_of = _clearance_of(request, loaded)
@@ -124,7 +136,7 @@ def kit_parameters(request: KitRequest, loaded: Mapping[str, Tool]) -> KitParame
 
 
 def _lengths(request: KitRequest) -> KitParameters:
-    """The parameters of the requested kit, without the fits of single tools."""
+    """Returns the parameters of a requested kit, except `clearance_of`."""
     parameters = KitParameters(always_nested=True)
     if request.clearance_mm is not None:
         parameters.clearance = round(1e-3 * request.clearance_mm, 7)
@@ -151,17 +163,17 @@ def _lengths(request: KitRequest) -> KitParameters:
 
 
 def _clearance_of(request: KitRequest, loaded: Mapping[str, Tool]) -> dict[str, float]:
-    """The clearances of single tools by name, in metres.
+    """Returns the clearances that are given for single tools, in metres, by the tools' names.
 
     Raises:
-        UserError: a name is not that of a tool, or a clearance is out of range.
+        UserError: the kit has no such tool, or a clearance is out of range.
     """
     clearances = {}
     for name, value in request.fit_of:
         tool = loaded.get(name) or next((t for t in loaded.values() if t.name == name), None)
         if tool is None:
             names = ", ".join(tool.name for tool in loaded.values())
-            raise UserError(f"--fit_of: '{name}' is not a tool of this kit: it has {names}")
+            raise UserError(f"--fit_of: the kit has no tool '{name}': give one of {names}")
         if not 0.0 <= value <= _WIDEST_MM:
             raise UserError(f"--fit_of {name}={value:g} is out of range: give 0 to {_WIDEST_MM:g}")
         clearances[tool.name] = round(1e-3 * value, 7)
@@ -169,7 +181,7 @@ def _clearance_of(request: KitRequest, loaded: Mapping[str, Tool]) -> dict[str, 
 
 
 def _on_grid(tools: Sequence[Tool], parameters: KitParameters) -> KitParameters:
-    """The parameters of a block with sides for Gridfinity's grid.
+    """Returns the parameters with a length and a width on Gridfinity's grid.
 
     Raises:
         UserError: the given sides are not on the grid, or the tools do not fit on any block.
@@ -186,14 +198,14 @@ def _on_grid(tools: Sequence[Tool], parameters: KitParameters) -> KitParameters:
     if given != right:
         advice = " ".join(f"{side:g}" for side in right)
         raise UserError(
-            f"--block_mm {given[0]:g} {given[1]:g}: with --base gridfinity the sides are multiples "
-            f"of {PITCH:g} mm less half a millimetre: give {advice}"
+            f"--block_mm {given[0]:g} {given[1]:g}: with --base gridfinity, length and width must "
+            f"be half a millimetre less than multiples of {PITCH:g} mm: give {advice}"
         )
     return parameters
 
 
 def _sheet_limits(sheet: SheetRequest | None) -> list[tuple[str, float, float, float]]:
-    """The flags of a sheet with their values and ranges."""
+    """Returns (flag, value, lowest, highest) for each flag of a sheet."""
     if sheet is None:
         return []
     return [
@@ -205,10 +217,10 @@ def _sheet_limits(sheet: SheetRequest | None) -> list[tuple[str, float, float, f
 
 
 def request_of(args: argparse.Namespace, robot: str) -> KitRequest:
-    """The request of a command line.
+    """Makes a request from a command line.
 
     Args:
-        args: the arguments of `describe_kit`.
+        args: the parsed arguments of `describe_kit`.
         robot: see `KitRequest`.
 
     Raises:
@@ -246,7 +258,7 @@ def request_of(args: argparse.Namespace, robot: str) -> KitRequest:
 
 
 def _fit_of(text: str) -> tuple[str, float]:
-    """Parses `NAME=FIT`, where FIT is one of `FITS` or mm a side."""
+    """Parses `TOOL=FIT` into the tool and its clearance on each side, in mm."""
     name, equals, fit = text.rpartition("=")
     try:
         value = FITS[fit] if fit in FITS else float(fit)
@@ -254,7 +266,9 @@ def _fit_of(text: str) -> tuple[str, float]:
         value = None
     if not name or not equals or value is None:
         names = ", ".join(FITS)
-        raise argparse.ArgumentTypeError(f"'{text}' is not TOOL=FIT; FIT is {names} or mm a side")
+        raise argparse.ArgumentTypeError(
+            f"'{text}' is not TOOL=FIT, where FIT is {names} or the clearance on each side in mm"
+        )
     return name, value
 
 
@@ -280,8 +294,8 @@ def describe_kit(maker: argparse.ArgumentParser) -> None:
         "--robot",
         type=Path,
         metavar="ROBOT.yaml",
-        help="a file with the robot arm, as for `decide`; reports how often the arm reaches "
-        "everything",
+        help="a file that describes your robot arm, as for `decide`; `kit` then reports in how "
+        "many simulated scenes the arm reaches all tools and cavities",
     )
     maker.add_argument("--quiet", action="store_true", help="print nothing but errors")
 
@@ -318,7 +332,7 @@ def _describe_cavities(maker: argparse.ArgumentParser) -> None:
         "--stand_out_mm",
         type=float,
         default=0.0,
-        help="by how much the tools stand out of the block (default: 0, flush)",
+        help="the height of the tools' tops above the block's top (default: 0, flush)",
     )
     maker.add_argument(
         "--lead_in_mm", type=float, help="the width of the bevel around the rims (default: 1)"
@@ -348,7 +362,10 @@ def _describe_block(maker: argparse.ArgumentParser) -> None:
         "--chamfer_mm", type=float, default=0.0, help="the bevel of the outer edges (default: 0)"
     )
     maker.add_argument(
-        "--nozzle_mm", type=float, default=0.4, help="thinner walls are reported (default: 0.4)"
+        "--nozzle_mm",
+        type=float,
+        default=0.4,
+        help="the width of the printer's nozzle; thinner walls are reported (default: 0.4)",
     )
     maker.add_argument(
         "--bed",
@@ -361,7 +378,7 @@ def _describe_block(maker: argparse.ArgumentParser) -> None:
         "--joint_play_mm",
         type=float,
         default=0.1,
-        help="between a dovetail and its socket, a side (default: 0.1)",
+        help="the gap between a dovetail and its socket, on each side (default: 0.1)",
     )
 
 
@@ -382,11 +399,19 @@ def _describe_sheet(maker: argparse.ArgumentParser) -> None:
         help="the folder of another kit to put on the sheet; may be repeated",
     )
     maker.add_argument(
-        "--copies", type=count_type, help="of each kit on the sheet (default: as many as fit)"
+        "--copies",
+        type=count_type,
+        help="the number of copies of each kit on the sheet (default: as many as fit)",
     )
     maker.add_argument(
-        "--margin_mm", type=float, default=10.0, help="around the sheet's kits (default: 10)"
+        "--margin_mm",
+        type=float,
+        default=10.0,
+        help="the least distance of a kit from the sheet's edge (default: 10)",
     )
     maker.add_argument(
-        "--gap_mm", type=float, default=5.0, help="between the sheet's kits (default: 5)"
+        "--gap_mm",
+        type=float,
+        default=5.0,
+        help="the least distance between two kits on the sheet (default: 5)",
     )

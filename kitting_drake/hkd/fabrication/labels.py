@@ -19,15 +19,16 @@ CAP_HEIGHTS = (0.007, 0.006, 0.005, 0.004)
 """Heights of capital letters to try, in metres."""
 
 _MARGIN, _EDGE = 0.0014, 0.004
-"""The least distance of letters from recesses and from the block's edge, in metres."""
+"""The least distances of letters in metres: from recesses, and from the block's edge."""
 _CELL = 0.0007
 """The side of a raster cell, in metres."""
 _FARTHEST = 0.03
 """The largest distance of a label from its cavity, in metres."""
 _PLAINLY = 1.5
 """The least ratio of a label's distance from other cavities to that from its own cavity."""
-# The cost of a label's position, in metres, is a sum of three terms: minus 6 times the height of
-# its letters; 6 mm if the text is rotated; and a tenth of its distance from the cavity's middle.
+# The cost of a label's position, in metres, is the sum of: its distance from the cavity; a tenth of
+# its distance from the cavity's middle; 6 mm if the text is rotated; and minus 6 times the height
+# of its letters.
 _DISTANCE_FOR_HEIGHT, _FROM_THE_SIDE, _OFF_THE_MIDDLE = 6.0, 0.006, 0.1
 _FONT_SIZE = 100.0
 
@@ -38,6 +39,7 @@ class _Lettering:
 
     outline: CrossSection
     cap_height: float
+    """The height of the capital letters, in metres."""
     rotated: bool
     """Whether the text is turned by 90 degrees."""
 
@@ -53,8 +55,9 @@ class _Raster:
     """A raster over the block on which masks are computed: rows along y, columns along x."""
 
     start: NDArray[np.float64]
-    """(x, y) of the lower left corner, in metres."""
+    """The (x, y) of the raster's lower left corner, in metres."""
     counts: tuple[int, int]
+    """The numbers of rows and columns."""
 
     def mask(self, outline: CrossSection) -> NDArray[np.bool_]:
         """Returns the mask (rows, columns) of the cells inside an outline."""
@@ -177,7 +180,7 @@ def _placed(
 
 
 def _letterings(text: str) -> list[_Lettering]:
-    """Lays out a text at each height to try, upright and turned by 90 degrees."""
+    """Lays out a text in each of `CAP_HEIGHTS`, upright and turned by 90 degrees."""
     # matplotlib is slow to import, and only labels need it.
     from matplotlib.font_manager import FontProperties
     from matplotlib.textpath import TextPath

@@ -13,19 +13,21 @@ from kitting_drake.hkd.kits.block import ARC_SEGMENTS, Cavity
 from kitting_drake.hkd.kits.kit import Kit
 
 RADII = (0.012, 0.010, 0.008)
-"""Radii to try in metres, widest first."""
+"""The radii of notches that are tried in this order, in metres."""
 DEEPEST = 0.020
 """The largest depth of a notch in metres: the reach of a finger."""
 
 _WALL = 0.003
 """The least wall around a notch in metres, unless the kit's own walls are thinner."""
 _SLIDES = tuple(sign * step for step in np.arange(0.0, 0.041, 0.004) for sign in (1, -1))
-"""Distances of a notch from the grasp along the tool to try, in metres."""
+"""The distances from the grasp, along the tool, at which a notch is tried, in metres."""
 _SHARES = (0.85, 1.15)
-"""The allowed area of a notch outside its cavity, as a share of a half disc's."""
+"""The least and largest area of a notch outside its cavity, as shares of a half disc's area."""
 _FINS = 1.6
-"""The allowed area of thin fins beside a notch, in multiples of the area that the test for fins
-finds at two right-angled corners."""
+"""The largest area of thin fins that the test in `_notch` may find beside a notch.
+
+It is given as a multiple of the area that the test finds at two right-angled corners.
+"""
 _OVERLAP = 0.001
 """The overlap of a notch with its cavity, in metres, so that no thin skin is left between them."""
 
@@ -70,7 +72,8 @@ def _best_pair(
 ) -> list[CrossSection]:
     """Returns the outlines of a tool's notches, or an empty list if none fits.
 
-    Two notches are preferred to one, then wide to narrow, then near the grasp to far.
+    Two notches are preferred to one. After that, larger notches are preferred, and then those
+    nearer to the grasp.
     """
     single: list[CrossSection] = []
     # The order of the search is the order of preference, so the first pair is the best.
@@ -89,7 +92,7 @@ def _best_pair(
 
 
 def _is_wall_between(one: CrossSection, other: CrossSection, cavity: Cavity, wall: float) -> bool:
-    """Whether two notches of a cavity have at least a wall's thickness between them."""
+    """Whether the wall between two notches of a cavity is at least `wall` metres thick."""
     return ((_grown(one, wall) ^ other) - cavity.outline).area() < 1e-9
 
 
@@ -124,7 +127,7 @@ def _beside(
 def _crossings(
     outline: CrossSection, start: NDArray[np.float64], direction: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """The signed distances (n) from `start` at which a line crosses an outline, in metres."""
+    """Returns the signed distances (n) from `start` at which a line crosses an outline, in m."""
     normal = np.array([-direction[1], direction[0]])
     found = [np.empty(0)]
     for loop in outline.to_polygons():
@@ -139,7 +142,10 @@ def _crossings(
 def _half_disc(
     centre: NDArray[np.float64], outward: NDArray[np.float64], radius: float
 ) -> CrossSection:
-    """Returns a disc about a point on the wall, cut off half a radius inside the cavity."""
+    """Returns a disc around a point on the wall, without the part deep inside the cavity.
+
+    The part that is cut off is more than half a radius from the wall.
+    """
     disc = CrossSection.circle(radius, ARC_SEGMENTS)
     kept = CrossSection.square((1.5 * radius, 2 * radius)).translate((-0.5 * radius, -radius))
     angle = math.degrees(math.atan2(outward[1], outward[0]))

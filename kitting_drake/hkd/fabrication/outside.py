@@ -17,13 +17,14 @@ from numpy.typing import NDArray
 PITCH = 42.0
 """The grid's pitch in mm."""
 GAP = 0.5
-"""By how much a bin is smaller than its cells, in mm."""
+"""How much smaller a bin is than its cells, in mm."""
 FOOT = ((0.0, 35.6, 0.8), (0.8, 37.2, 1.6), (2.6, 37.2, 1.6), (4.75, 41.5, 3.75))
-"""A foot's outline from the bottom up: height, side and radius of the corners, in mm."""
+"""The square sections of a foot from the bottom up: height, side and corner radius, in mm."""
 FOOT_HEIGHT = FOOT[-1][0]
+"""The height of a foot, in mm."""
 
 _SECTION_HEIGHTS = (0.0, 1.7, 3.2, 3.8, 4.4)
-"""Heights of the feet's sections, in mm."""
+"""The heights of the sections that `foot_sections` returns, in mm."""
 _ARC_SEGMENTS = 64
 
 
@@ -34,16 +35,16 @@ class Outside:
     chamfer_mm: float = 0.0
     """The width of the bevel along the block's outer edges; zero for none."""
     gridfinity: bool = False
-    """Whether the block stands on feet; its sides are those of `grid_side`."""
+    """Whether the block stands on Gridfinity's feet. `grid_side` gives the sides for these."""
 
     @property
     def raised_mm(self) -> float:
-        """By how much the feet raise the block."""
+        """The height by which the feet raise the block, in mm."""
         return FOOT_HEIGHT if self.gridfinity else 0.0
 
 
 def grid_side(side: float) -> float:
-    """The least side of a bin, in mm, that is at least `side`."""
+    """Returns the side of the smallest bin on the grid whose side is at least `side`, in mm."""
     return PITCH * max(1, math.ceil((side + GAP) / PITCH - 1e-9)) - GAP
 
 
@@ -51,11 +52,12 @@ def shaped(block: Manifold, outside: Outside) -> Manifold:
     """Shapes the outside of a block.
 
     Args:
-        block: in mm, its lower corner at the origin.
+        block: the block in mm, with its lower corner at the origin.
         outside: the shape.
 
     Returns:
-        The block with its lower corner, or that of its feet, at the origin.
+        The shaped block. The lower corner of the block, or of the block with its feet, is at the
+        origin.
     """
     if not outside.chamfer_mm and not outside.gridfinity:
         return block
@@ -80,7 +82,7 @@ def foot_sections(size: tuple[float, float]) -> list[CrossSection]:
     """Returns sections of a block's feet at several heights, the lowest first, in mm.
 
     Args:
-        size: the block's length and width.
+        size: the block's length and width, in mm.
     """
     heights, sides, radii = np.array(FOOT).T
     sections = []
@@ -97,13 +99,13 @@ def foot_sections(size: tuple[float, float]) -> list[CrossSection]:
 
 
 def _cells(size: tuple[float, float]) -> Iterator[tuple[int, int]]:
-    """The columns and rows of the cells below a block."""
+    """Returns the (column, row) of each cell below a block of the given size in mm."""
     columns, rows = (round((side + GAP) / PITCH) for side in size)
     return itertools.product(range(columns), range(rows))
 
 
 def _foot() -> Manifold:
-    """The foot of the cell at the origin of a bin's frame."""
+    """Returns the foot below the cell in column 0 and row 0, in mm."""
     side = PITCH - GAP
     rings = [_ring((side, side), r, (side - s) / 2, z) for z, s, r in FOOT]
     foot = Manifold()
@@ -113,7 +115,7 @@ def _foot() -> Manifold:
 
 
 def _ring(size: tuple[float, float], radius: float, inset: float, z: float) -> NDArray[np.float64]:
-    """The corners (n, 3) of a rounded rectangle at a height.
+    """Returns the corners (n, 3) of a rounded rectangle at a height, in mm.
 
     Args:
         size: the sides of the rectangle without the inset, in mm; its corner is at the origin.

@@ -21,7 +21,7 @@ _SHADOW = (0.20, 0.08, 0.0)
 _LIGHT = np.array([-0.45, 0.55, 0.70]) / np.linalg.norm([-0.45, 0.55, 0.70])
 """The unit vector towards the light, in the kit frame."""
 _ROOMIEST = 0.032
-"""The largest distance of a depth's text from its cavity's wall that is tried, in metres."""
+"""The largest distance from a cavity's wall at which a place for the depth is sought, in metres."""
 _INCHES = 7.5
 """The width of each of the two views, in inches."""
 
@@ -141,8 +141,7 @@ def _fill(axes: Any, design: Design, outline: CrossSection, colour: Any, alpha: 
     loops = loops_mm(outline, design.kit.parameters)
     if loops:
         path = Path.make_compound_path(*(Path(np.vstack([a, a[:1]]), closed=True) for a in loops))
-        # Not `add_patch`, because it also computes the patch's extent, which takes longer than
-        # drawing.
+        # `add_patch` would also compute the patch's extent, which takes longer than drawing.
         axes.add_artist(PathPatch(path, facecolor=colour, edgecolor="none", alpha=alpha))
 
 

@@ -16,11 +16,11 @@ from kitting_drake.hkd.fabrication.splitting.opening import (
 )
 
 _TINY = 1e-9
-"""Areas below this, in square metres, are rounding."""
+"""The area in square metres below which an overlap is ignored as a rounding error."""
 
 
 def wall_notes(design: Design, nozzle: float) -> list[str]:
-    """A sentence for each wall of a block that is thinner than a nozzle.
+    """Returns a sentence for each wall of a block that is missing or thinner than a nozzle.
 
     Args:
         design: the block.
@@ -52,11 +52,11 @@ def wall_notes(design: Design, nozzle: float) -> list[str]:
 
 
 def undercut_notes(solid: Manifold, design: Design) -> list[str]:
-    """A sentence for each tool above whose cavity the block overhangs.
+    """Returns a sentence for each tool whose cavity is partly covered by an overhang.
 
     Args:
         solid: the block in the frame of the files, in mm.
-        design: its design.
+        design: the block's design.
     """
     mesh = solid.to_mesh64()
     corners = np.asarray(mesh.vert_properties, dtype=float)[:, :3][np.asarray(mesh.tri_verts)]
@@ -101,7 +101,7 @@ def _vanished(
 def _between(
     part: CrossSection, recesses: Sequence[Recess], room: CrossSection, nozzle: float
 ) -> str:
-    """The tools on both sides of a wall."""
+    """Returns a text that names the tools, or the block's side, beside a wall."""
     near = part.offset(nozzle / 2, JoinType.Round)
     names = dict.fromkeys(r.tool for r in recesses if not (near ^ r.outline).is_empty())
     sides = _quoted(names)
@@ -111,7 +111,7 @@ def _between(
 
 
 def _thickness(part: CrossSection, material: CrossSection, nozzle: float) -> float:
-    """The thickness of a wall where it is thinnest, in metres."""
+    """Returns the thickness of a wall where it is thinnest, in metres."""
     x_min, y_min, x_max, y_max = part.bounds()
     box = CrossSection.square((x_max - x_min + 4 * nozzle, y_max - y_min + 4 * nozzle))
     here = material ^ box.translate((x_min - 2 * nozzle, y_min - 2 * nozzle))
@@ -133,7 +133,7 @@ def _place(part: CrossSection, design: Design) -> str:
 
 
 def _distance(point: NDArray[np.float64], recess: Recess, design: Design) -> float:
-    """The distance of a point (3) in mm from the bounds of a recess, from above."""
+    """Returns the horizontal distance of a point (3) from the bounds of a recess, in mm."""
     x_min, y_min, x_max, y_max = recess.outline.bounds()
     corners = in_block(np.array([(x_min, y_min), (x_max, y_max)]), design.kit.parameters)
     outside = np.maximum(corners[0] - point[:2], point[:2] - corners[1])

@@ -1,4 +1,4 @@
-"""A picture of a block's pieces, drawn apart, with their numbers and dovetails."""
+"""Draws a block's pieces apart from each other, with their numbers and dovetails."""
 
 import io
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ def assembly_png(split: Split, openings: Sequence[Opening]) -> bytes:
 
     Args:
         split: the pieces.
-        openings: what is cut into the block.
+        openings: the block's recesses.
     """
     import matplotlib
 
@@ -65,7 +65,7 @@ def assembly_png(split: Split, openings: Sequence[Opening]) -> bytes:
 def _shifts(
     pieces: Sequence[Piece], middle: NDArray[np.float64], apart: float
 ) -> NDArray[np.float64]:
-    """How far each piece (n, 2) is drawn from its place."""
+    """Returns the shifts (n, 2) that draw the pieces apart from each other, in mm."""
     centres = np.array([np.array(p.region.bounds()).reshape(2, 2).mean(axis=0) for p in pieces])
     sizes = np.array([p.region.bounds() for p in pieces])
     step = (sizes[:, 2:] - sizes[:, :2]).mean(axis=0)

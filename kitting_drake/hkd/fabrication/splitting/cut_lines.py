@@ -1,9 +1,9 @@
-"""Chooses where a block is cut: lines from side to side that pass between the cavities.
+"""Chooses the cuts that divide a block. They pass between the cavities where possible.
 
-A cut is a polyline that never turns back, so a dynamic program over a raster of costs finds the
-best one: cheap in solid material, dearer across a cavity, and dearest along a cavity's wall, where
-it would leave a thin wall. Cuts along y divide the block into strips; cuts along x divide each
-strip on its own.
+A cut is a polyline from one side of the block to the opposite side that never turns back, so
+dynamic programming over a raster of costs finds the cheapest cut. The cost is low in solid
+material, higher across a cavity, and highest along a cavity's wall, where a cut would leave a thin
+wall. Cuts along y divide the block into strips. Cuts along x then divide each strip separately.
 """
 
 import itertools
@@ -26,21 +26,23 @@ from kitting_drake.hkd.fabrication.splitting.opening import (
 from kitting_drake.hkd.kits.nesting import rasterized
 
 TAB_REACH = 8.0
-"""By how much a piece's dovetails reach into its neighbours, at most, in mm."""
+"""The largest length by which a dovetail sticks out of its piece, in mm."""
 
 _CELL = 0.5
+"""The side of a raster cell, in mm."""
 # Costs of a cut per mm: through solid material, along a wall, across a cavity, through a label.
 _SOLID, _WALL, _CAVITY, _LABEL = 1.0, 30.0, 12.0, 8.0
 _FOOT, _FOOT_SIDE, _OFF_THE_MIDDLE = 3.0, 8.0, 2.0
-"""Additional costs per mm through a foot, along its side, and for each mm nearer to a foot."""
+"""Additional costs of a cut per mm: through a foot; along a foot's side; and between feet, for each
+mm of distance from the middle."""
 _ROOMY = 4.0
-"""Cuts keep this distance from cavities where they can, in mm."""
+"""The distance from cavities that cuts keep where possible, in mm."""
 _STEEPEST = 4
 """The largest sideways step of a cut for each step forward, in cells."""
 _UPRIGHT_ENDS = 6.0
-"""The length over which a cut meets the block's side at a right angle, in mm."""
+"""The length of both ends of a cut in mm, on which it is perpendicular to the block's side."""
 _REPAIRS = 8
-"""How often cuts are moved away from thin walls."""
+"""The largest number of attempts to find cuts that leave no thin wall."""
 _BARRED = 400.0
 """The additional cost per mm at a place where a cut left a thin wall."""
 
@@ -50,13 +52,14 @@ Line = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Cuts:
-    """How a block is divided."""
+    """The cuts that divide a block, and the pieces."""
 
     lines: tuple[Line, ...]
-    """All cuts; those along x go from side to side, beyond their strip."""
+    """All cuts. Those along x have the block's whole length, although they divide only a strip."""
     regions: tuple[CrossSection, ...]
-    """The pieces from above, strip by strip."""
+    """The outlines of the pieces from above, strip by strip."""
     cost: float
+    """The sum of the costs of the cuts."""
 
 
 def choose_cuts(
@@ -69,13 +72,13 @@ def choose_cuts(
 
     Args:
         size: the block's length and width, in mm.
-        openings: what is cut into it.
-        bed: the sides of the bed; pieces may be turned by 90 degrees.
-        feet: sections of the feet below the block, the lowest first; cuts go between feet if they
-            can.
+        openings: the block's recesses.
+        bed: the sides of the bed, in mm; pieces may be turned by 90 degrees.
+        feet: sections of the feet below the block, the lowest first. Cuts go between the feet
+            where possible.
 
     Returns:
-        The cuts, or None if each choice leaves a wall thinner than `LEAST_WALL`.
+        The cuts, or None if all cuts that were tried leave a wall thinner than `LEAST_WALL`.
     """
     for extra in (0, 1, 2):
         found = [
@@ -91,7 +94,13 @@ def choose_cuts(
 def _counts(
     size: tuple[float, float], bed: tuple[float, float], extra: int
 ) -> Iterator[tuple[tuple[int, int], tuple[float, float]]]:
-    """Numbers of pieces along x and y to try, with the bed as it is turned."""
+    """Yields the numbers of pieces along x and y to try, and the bed's sides along x and y.
+
+    Args:
+        size: the block's length and width, in mm.
+        bed: the sides of the bed, in mm.
+        extra: the number of columns and rows of pieces in addition to the least possible ones.
+    """
     options = []
     for turned in dict.fromkeys((bed, bed[::-1])):
         least = [
@@ -110,11 +119,11 @@ def _counts(
 
 
 def _windows(side: float, room: float, count: int) -> list[tuple[float, float]]:
-    """The range of each cut, such that all pieces with their dovetails fit.
+    """Returns the range of each cut, in mm, in which all pieces with their dovetails fit the bed.
 
     Args:
-        side: the side to divide, in mm.
-        room: the bed's side.
+        side: the side of the block to divide, in mm.
+        room: the bed's side, in mm.
         count: the number of pieces.
     """
     reach = room - TAB_REACH
@@ -125,7 +134,7 @@ def _windows(side: float, room: float, count: int) -> list[tuple[float, float]]:
 
 
 class _Cutter:
-    """Finds cuts for one way to turn the bed."""
+    """Finds the cuts of a block for one orientation of the bed."""
 
     def __init__(
         self,
@@ -147,7 +156,7 @@ class _Cutter:
         return rasterized(outline, np.zeros(2), self._counts, _CELL)
 
     def _prices(self, labels: CrossSection) -> NDArray[np.float64]:
-        """The cost per mm of a cut through each cell: rows along y, columns along x."""
+        """Returns the cost per mm of a cut through each cell (rows along y, columns along x)."""
         inside = self._mask(self._open)
         outside = ndimage.distance_transform_edt(~inside) * _CELL if inside.any() else None
         if outside is None:
@@ -159,7 +168,7 @@ class _Cutter:
         return price + _LABEL * self._mask(labels.offset(0.8, JoinType.Round))
 
     def _foot_prices(self, feet: Sequence[CrossSection]) -> NDArray[np.float64]:
-        """The additional cost per mm of a cut through feet, and along their sides."""
+        """Returns the cost per mm through each cell that the feet add (rows, columns)."""
         price = np.zeros(self._counts)
         if feet:
             inside = self._mask(feet[0])
@@ -167,14 +176,15 @@ class _Cutter:
             within = ndimage.distance_transform_edt(inside) * _CELL
             near = LEAST_WALL + _CELL
             price += _FOOT * inside + _FOOT_SIDE * ((from_foot < near) & (within < near))
-            # The middle between two feet is best, because feet are wider above.
+            # Prefer the middle between two feet, because feet are wider at their tops.
             price += _OFF_THE_MIDDLE * (from_foot.max() - from_foot) * ~inside
         return price
 
     def cuts(self, counts: tuple[int, int]) -> Cuts | None:
         """Divides the block into the given numbers of pieces along x and y.
 
-        Returns None if all cuts that were tried leave a thin wall.
+        Returns:
+            The cuts, or None if all cuts that were tried leave a thin wall.
         """
         price = self._price.copy()
         for _ in range(_REPAIRS):
@@ -215,7 +225,13 @@ class _Cutter:
     def _line(
         self, price: NDArray[np.float64], window: tuple[float, float], axis: int
     ) -> tuple[Line, float]:
-        """The cheapest cut whose coordinate along `axis` stays in a window, and its cost."""
+        """Returns the cheapest cut, and its cost.
+
+        Args:
+            price: the cost per mm of a cut through each cell (rows, columns).
+            window: the range of the cut's coordinate along `axis`, in mm.
+            axis: 0 for a cut along y, 1 for a cut along x.
+        """
         field = price if axis == 0 else price.T
         end = self._size[1 - axis]
         low, high = math.ceil(window[0] / _CELL), math.floor(window[1] / _CELL)
@@ -226,7 +242,7 @@ class _Cutter:
         return (line if axis == 0 else line[:, ::-1]), cost
 
     def _thin(self, regions: Sequence[CrossSection]) -> list[CrossSection]:
-        """The thin walls and sharp tips that the cuts make, without those of the whole block."""
+        """Returns thin walls and sharp tips of the pieces that the uncut block does not have."""
         for solid, known in self._levels:
             found = []
             for region in regions:
@@ -242,10 +258,9 @@ class _Cutter:
 def _levels(
     size: tuple[float, float], openings: Sequence[Opening], feet: Sequence[CrossSection]
 ) -> Iterator[tuple[CrossSection, CrossSection]]:
-    """The block's material at its top, at its bottom, above each floor, and in its feet.
+    """Yields horizontal sections of the uncut block, with the thin parts of each section.
 
-    Yields:
-        The material, and its own thin parts.
+    The sections are at the block's top, at its bottom, above each floor and through its feet.
     """
     room = CrossSection.square(size)
     deep = [opening for opening in openings if not opening.is_label]
@@ -278,9 +293,8 @@ def _cheapest_path(price: NDArray[np.float64]) -> tuple[NDArray[np.int64], float
             source = slice(max(0, -shift), columns + min(0, -shift))
             if target.start >= columns or source.start >= columns or columns <= abs(shift):
                 continue
-            # The mean of the cells on the way, sampled at both ends and in the middle.
-            middle = (price[row, target] + price[row - 1, source]) / 2
-            options[number, target] = best[source] + lengths[number] * middle
+            mean = (price[row, target] + price[row - 1, source]) / 2
+            options[number, target] = best[source] + lengths[number] * mean
         came[row] = np.argmin(options, axis=0)
         best = options[came[row], np.arange(columns)]
     column = int(np.argmin(best))
@@ -294,11 +308,11 @@ def _cheapest_path(price: NDArray[np.float64]) -> tuple[NDArray[np.int64], float
 
 
 def _straightened(points: Line, price: NDArray[np.float64]) -> Line:
-    """Replaces runs of a path by straight lines that cost hardly more.
+    """Replaces parts of a path by straight lines that cost hardly more.
 
     Args:
-        points: (n, 2), the second coordinate rising.
-        price: rows along the second coordinate.
+        points: the path (n, 2) in mm, along which the second coordinate increases.
+        price: the costs per mm; the rows are along the second coordinate.
     """
 
     def cost(a: Line, b: Line) -> float:
@@ -314,7 +328,7 @@ def _straightened(points: Line, price: NDArray[np.float64]) -> Line:
     first_free, last_free = min(margin, last), max(last - margin, 0)
     while kept[-1] < last:
         start = kept[-1]
-        # The ends stay upright.
+        # The ends stay perpendicular to the block's sides.
         limit = first_free if start < first_free else last_free if start < last_free else last
         end = limit
         while end > start + 1:
@@ -326,7 +340,7 @@ def _straightened(points: Line, price: NDArray[np.float64]) -> Line:
 
 
 def _extended(line: Line, axis: int) -> Line:
-    """A cut that reaches beyond the block, without a change of its inner part."""
+    """Returns a cut with both ends extended beyond the block."""
     along = 1 - axis
     low, high = line[0].copy(), line[-1].copy()
     low[along] -= 9.0

@@ -21,9 +21,9 @@ from kitting_drake.hkd.fabrication.splitting.opening import (
 )
 
 SIZES = ((10.0, 15.0, TAB_REACH), (6.0, 9.0, 5.0))
-"""Widths at the root and at the tip, and reach of the dovetails to try, in mm."""
+"""The dovetails to try: width at the root, width at the tip, and length, in mm."""
 APART = 60.0
-"""Neighbouring pieces have about one dovetail for each of these lengths, and two if possible."""
+"""The approximate distance between dovetails of the same two pieces, in mm."""
 
 _ROOF = 2.0
 """The least material above a dovetail that ends below a floor, in mm."""
@@ -32,8 +32,9 @@ _LOWEST = 5.0
 _MARGIN = LEAST_WALL + 0.6
 """The least material around a dovetail, in mm."""
 _STEP = 1.5
+"""The distance between the places along a cut that are tried, in mm."""
 _ROOT = 1.0
-"""By how much a dovetail overlaps its own piece, in mm."""
+"""The length by which a dovetail overlaps its own piece, in mm."""
 
 
 @dataclass(frozen=True)
@@ -49,18 +50,22 @@ class Joint:
 
 
 _Box = tuple[float, float, float, float]
+"""The bounds x_min, y_min, x_max, y_max of an outline, in mm."""
 _Boxed = tuple[Opening, _Box]
-"""An opening with the bounds of its outline, which are slow to compute."""
+"""An opening, and the bounds of its outline, which are slow to compute."""
 
 
 @dataclass(frozen=True)
 class _Place:
+    """A place that has room for a dovetail."""
+
     joint: Joint
     middle: NDArray[np.float64]
+    """The middle (2) of the dovetail's root, in mm."""
 
     @property
     def value(self) -> float:
-        """Prefer high and wide dovetails."""
+        """The quality of the joint, which grows with the dovetail's height and area."""
         return self.joint.height * float(np.sqrt(self.joint.outline.area()))
 
 
@@ -75,9 +80,9 @@ def choose_joints(
 
     Args:
         lines: the cuts.
-        regions: the pieces from above.
-        openings: what is cut into the block.
-        height: the block's height.
+        regions: the outlines of the pieces from above.
+        openings: the block's recesses.
+        height: the block's height, in mm.
         feet: sections of the feet below the block.
 
     Returns:
@@ -102,7 +107,14 @@ def _spread(
     regions: Sequence[CrossSection],
     feet: Sequence[CrossSection],
 ) -> list[Joint]:
-    """The best places of a seam, spread along it."""
+    """Returns the best joints between two pieces, spread along the seam.
+
+    Args:
+        places: the places along the seam that have room for a dovetail.
+        taken: the joints of other pieces.
+        regions: see `choose_joints`.
+        feet: see `choose_joints`.
+    """
     middles = np.array([place.middle for place in places])
     along = np.linalg.norm(middles - middles[0], axis=1)
     count = max(2, round((along.max() + 2 * APART / 3) / APART))
@@ -130,7 +142,7 @@ def _spread(
 def _keeps_walls(
     joint: Joint, regions: Sequence[CrossSection], feet: Sequence[CrossSection]
 ) -> bool:
-    """Whether all walls between a joint and a bend of the cut or a foot's side are thick enough."""
+    """Whether no wall beside a joint is thinner than `LEAST_WALL`, in the pieces and their feet."""
     near = joint.outline.offset(4 * _MARGIN, JoinType.Miter)
     owner, other = (regions[i] ^ near for i in (joint.owner, joint.other))
     inner = joint.outline.offset(2 * _MARGIN, JoinType.Miter)
@@ -201,12 +213,20 @@ def _fitted(
     openings: Sequence[_Boxed],
     height: float,
 ) -> Joint | None:
-    """The joint at a place, or None if there is no room."""
+    """Returns the joint with a given outline, or None if it finds no room.
+
+    Args:
+        outline: the outline of the dovetail.
+        pair: the indices of the dovetail's piece and of the socket's piece.
+        regions: the outlines of the pieces from above.
+        openings: the block's recesses, with their bounds.
+        height: the block's height, in mm.
+    """
     owner, other = pair
     around = outline.offset(_MARGIN, JoinType.Round)
     if (around - regions[owner] - regions[other]).area() > 1e-6:
         return None
-    # Besides its root, the dovetail is inside the other piece, and nowhere near that piece's end.
+    # The dovetail may overlap its own piece only at the root.
     inside = outline.offset(-_ROOT - 0.2, JoinType.Round) ^ regions[owner]
     if inside.area() > 1e-6:
         return None

@@ -1,4 +1,4 @@
-"""What is cut into a block from above, as the cuts between pieces see it."""
+"""The recesses of a block that is split, and helpers that find thin walls."""
 
 import math
 from collections.abc import Iterable
@@ -20,21 +20,21 @@ class Opening:
     """A recess, in mm in the frame of the files."""
 
     outline: CrossSection
-    """Its outline at the top, outside the bevel."""
+    """The outline of the recess at the block's top, including the bevel."""
     floor: float
-    """The height of its floor above the block's bottom."""
+    """The height of the recess's floor."""
     is_label: bool = False
     below_bevel: CrossSection | None = None
-    """Its outline below the bevel; None: it has no bevel."""
+    """The outline of the recess below the bevel. None: the recess has no bevel."""
 
     @property
     def walls(self) -> CrossSection:
-        """The outline of its upright walls."""
+        """The outline of the recess's upright walls."""
         return self.outline if self.below_bevel is None else self.below_bevel
 
 
 def united(outlines: Iterable[CrossSection]) -> CrossSection:
-    """The union of outlines."""
+    """Returns the union of outlines."""
     union = CrossSection()
     for outline in outlines:
         union += outline
@@ -42,21 +42,21 @@ def united(outlines: Iterable[CrossSection]) -> CrossSection:
 
 
 def corner_area(least: float) -> float:
-    """The area that `thin_parts` finds at the tip of a corner with the angle `_SHARPEST`.
+    """Returns the area that `thin_parts` finds at the tip of a corner with the angle `_SHARPEST`.
 
-    A part with at most this area is therefore the tip of a corner, not a thin wall.
+    A part with at most this area counts as the tip of a corner, not as a thin wall.
     """
     return (least / 2) ** 2 * (1 / math.tan(_SHARPEST / 2) - (math.pi - _SHARPEST) / 2)
 
 
 def thin_parts(shape: CrossSection, least: float) -> CrossSection:
-    """The parts of a shape that are thinner than `least`, and the tips of its corners."""
+    """Returns the parts of a shape that are thinner than `least`, and the tips of its corners."""
     inner = shape.offset(-least / 2, JoinType.Round, circular_segments=64)
     return shape - inner.offset(least / 2, JoinType.Round, circular_segments=64)
 
 
 def roomiest_point(outline: CrossSection, farthest: float) -> NDArray[np.float64]:
-    """An approximation of the point (2) of an outline furthest from its boundary.
+    """Returns approximately the point (2) inside an outline that is farthest from its boundary.
 
     Args:
         outline: the outline.

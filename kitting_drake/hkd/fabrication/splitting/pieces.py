@@ -13,11 +13,10 @@ from kitting_drake.hkd.fabrication.splitting.joints import Joint, choose_joints
 from kitting_drake.hkd.fabrication.splitting.opening import LEAST_WALL, Opening
 
 _BEYOND = 1.0
-"""The distance by which cutters stick out of the block, in mm."""
+"""The length by which the prisms that cut or join the pieces stick out of the block, in mm."""
 _MOST_PIECES = 40
 _UPRIGHT = 2
-"""The number of sections of the feet, from the lowest one on, that lie below the feet's upper
-slope."""
+"""The number of sections of the feet that lie below the upper slope of the feet."""
 
 
 @dataclass(frozen=True)
@@ -25,14 +24,15 @@ class Piece:
     """A piece of a block, in the block's frame, in mm."""
 
     number: int
-    """The number of the piece, counted from 1. A piece is lowered onto those with lower numbers."""
+    """The number of the piece, counted from 1. Pieces are laid down in the order of numbers."""
     body: Manifold
+    """The piece with its dovetails and sockets."""
     region: CrossSection
-    """The outline of the piece from above, without its joints."""
+    """The outline of the piece from above, without dovetails and sockets."""
 
     @property
     def corner(self) -> NDArray[np.float64]:
-        """The lower corner (3) of its bounding box: the origin of its files."""
+        """The lower corner (3) of the piece's bounding box, which is the origin of its files."""
         return np.array(self.body.bounding_box()[:3])
 
     @property
@@ -62,8 +62,8 @@ def split_block(
     """Splits a block that is larger than a bed.
 
     Args:
-        block: the block, in mm, its lower corner at the origin.
-        openings: what is cut into it from above.
+        block: the block in mm, with its lower corner at the origin.
+        openings: the block's recesses.
         bed: the sides of the bed, in mm; pieces may be turned by 90 degrees.
         play: see `Split.play`.
         feet: see `choose_cuts`.
@@ -79,7 +79,9 @@ def split_block(
         return None
     named = f"--bed {bed[0]:g} {bed[1]:g}"
     if min(bed) < 4 * TAB_REACH or length * width > _MOST_PIECES * bed[0] * bed[1]:
-        raise UserError(f"{named} is too small for a block of {length:g} by {width:g} mm")
+        raise UserError(
+            f"{named} is too small for a block of {length:g} by {width:g} mm: make a smaller block"
+        )
     notes = []
     cuts = choose_cuts((length, width), openings, bed, feet)
     if cuts is None and feet:
@@ -113,7 +115,7 @@ def split_block(
 
 
 def fits(size: tuple[float, ...], bed: tuple[float, float]) -> bool:
-    """Whether a rectangle fits a bed, turned by 90 degrees if need be."""
+    """Whether a rectangle fits a bed, as it is or turned by 90 degrees."""
     (a, b), (room_a, room_b) = size, bed
     tiny = 1e-6
     return (a <= room_a + tiny and b <= room_b + tiny) or (
@@ -126,7 +128,7 @@ def _prism(outline: CrossSection, low: float, high: float) -> Manifold:
 
 
 def _notes(pieces: Sequence[Piece], joints: Sequence[Joint]) -> list[str]:
-    """A sentence for each pair of neighbours without a joint."""
+    """Returns a sentence for each pair of neighbouring pieces without a dovetail."""
     joined = {(joint.owner, joint.other) for joint in joints}
     notes = []
     for i, one in enumerate(pieces):
