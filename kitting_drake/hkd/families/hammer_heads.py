@@ -1,7 +1,7 @@
-"""Heads of hammers: a block around the eye, with an end on either side.
+"""Heads of hammers: a block around the eye, with a front end and a back end.
 
-The head's axis is y. A section's height is along x, and its thickness along z. Ends are built
-toward +y, the side of the striking face; the other end is then flipped.
+The head's axis is y. A section's height is along x, and its thickness along z. Both ends are built
+toward +y, the side of the striking face. The back end is then flipped.
 """
 
 from collections.abc import Callable, Sequence
@@ -67,8 +67,7 @@ class Section(NamedTuple):
 
 
 def head_loft(stations: Sequence[Section], octagonal: bool = False) -> Shape:
-    """Makes a skin through sections; its hulls have fewer corners but nearly the same
-    projections."""
+    """Makes a loft through sections. Its hulls have fewer corners than its solid."""
 
     def sections(segments: int) -> list[np.ndarray]:
         rings = []
@@ -145,7 +144,7 @@ def _bell(e: HeadEnd, height: float, thickness: float, start: float) -> tuple[Sh
 
 
 def _face(e: HeadEnd, start: float) -> Shape:
-    """Builds the last millimetres of a striking end; its hulls omit the crown."""
+    """Builds the last millimetres of a striking end. Its hulls omit the milled pattern."""
     size, deep, end = e.size_mm, e.thickness_mm or e.size_mm, e.reach_mm
     rim = [
         Section(start, size, deep, e.roundness),
@@ -273,8 +272,7 @@ def _point(e: HeadEnd, height: float, thickness: float, start: float) -> tuple[S
 
 
 def _claw(e: HeadEnd, height: float, thickness: float, start: float) -> tuple[Shape, None]:
-    """Builds a tapered band with a split edge, which bends toward the handle with a smooth upper
-    side."""
+    """Builds a tapered band that bends toward the handle and may be split at its edge."""
     root, wide = min(height, e.neck_mm), e.thickness_mm or thickness
     top = root / 2
 

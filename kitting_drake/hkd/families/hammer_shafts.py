@@ -22,8 +22,8 @@ class Shaft:
     kind: str = "plain"
     length_mm: float = 320.0
     # The widths along y of the straight part behind the head, of the throat where the grip begins,
-    # of the grip's swell, and of the grip's end. Then the thicknesses along z as shares of the
-    # widths.
+    # of the grip's swell, and of the grip's end. Then the thicknesses along z of the neck and of
+    # the grip, as shares of the widths.
     neck_width_mm: float = 25.0
     throat_width_mm: float = 23.0
     swell_width_mm: float = 32.0
@@ -37,12 +37,12 @@ class Shaft:
     # cut off straight.
     roundness: float = 0.55
     octagonal: bool = False
-    # The distance by which the middle line bows toward the face, and the distance by which the end
-    # bows back from there.
+    # The distance by which the handle's middle line bows toward the face. Near its end, the line
+    # bows away from the face by half as much.
     bow_mm: float = 0.0
     # The number of grooves in the grip.
     ribs: int = 7
-    # Whether the broad sides of a steel neck, made in one piece with the head, have hollows.
+    # Whether the broad sides of the neck have hollows, as on some steel handles.
     fullered: bool = False
     # Materials of the parts, keys of solids.MATERIALS.
     material: str = "hickory"
@@ -55,7 +55,7 @@ def _section(width: float, thickness: float, roundness: float, segments: int) ->
 
 
 def octagon_corners(width: float, thickness: float) -> list[tuple[float, float]]:
-    """Returns the corners of a rectangle about the origin whose corners are cut off."""
+    """Returns the corners of an octagon: a rectangle around the origin without its corners."""
     y, z, cut = width / 2, thickness / 2, 0.27 * thickness
     return [
         (-y + cut, -z), (y - cut, -z), (y, -z + cut), (y, z - cut),
@@ -89,7 +89,7 @@ def build_shaft(s: Shaft, top: float) -> list[Part]:
     grooved = sleeve.solid
     rings = None
     for a, b in zip(edges[1::2], edges[2::2], strict=False):
-        # Keep grooves so narrow that cavities bridge them.
+        # Keep the grooves so narrow that the outlines of cavities bridge them.
         middle, half = 0.5 * (a + b), min(0.3 * (b - a), 1.3 / s.length_mm)
         a, b = middle - half, middle + half
         widths = np.interp([a, b], [u for u, _ in grip], [w for _, w in grip])
@@ -142,7 +142,10 @@ def _grip_stations(s: Shaft) -> list[tuple[float, float]]:
 
 
 def _loft(s: Shaft, top: float, stations: list[tuple[float, float, float]]) -> Shape:
-    """Makes a loft through (share of length, width, thickness); its hulls have fewer corners."""
+    """Makes a loft through stations, each (share of the handle's length, width, thickness).
+
+    Its hulls have fewer corners than its solid.
+    """
 
     def rings(segments: int) -> list[np.ndarray]:
         result = []
@@ -166,7 +169,7 @@ def _bow(s: Shaft, u: float) -> float:
 
 
 def _hollows(s: Shaft, top: float) -> Manifold:
-    """Builds the hollows along the broad sides between head and grip."""
+    """Builds the hollows in the broad sides of the neck, between head and grip."""
     start, end = 0.13 * s.length_mm, (s.neck_share - 0.015) * s.length_mm
     thickness = s.flatness * s.neck_width_mm
     half = 0.24 * s.neck_width_mm

@@ -25,24 +25,27 @@ from kitting_drake.hkd.tools.solids import (
 )
 
 SHORTEST_MM, LONGEST_MM = 15.0, 350.0
-"""The shortest and the longest part."""
+"""The least and the largest length of a part."""
 THINNEST_MM = 4.0
-"""The least height of a part. The pads end 1.5 mm above the table."""
+"""The least height of a part. The lower edges of the jaws' pads stay 1.5 mm above the table."""
 WIDEST_MM = 70.0
-"""The largest width between the jaws; they open to 80 mm."""
+"""The largest width of a part between the jaws, which open to 80 mm."""
 
 _BEVEL = 0.4
 _FRAME = 5.0
-"""The thickness of a board's frame. A bare board of 1.6 mm is too thin for pads that end 1.5 mm
-above the table."""
+"""The height of the frame around a circuit board.
+
+A bare board is 1.6 mm thick, which is too thin for the jaws: their pads stay 1.5 mm above the
+table.
+"""
 _SEGMENTS = 36
 _SECTORS = 12
 _ROUND = 24
-"""The order of symmetry of a round part."""
+"""The order of rotational symmetry that a round part is given."""
 _PAD = 17.6
 """The length of the jaws' pads."""
 _INNER_REACH = 58.0
-"""The reach of the open jaw's inner finger from the grasp, with a margin of 3 mm."""
+"""The distance from the grasp to the far side of a finger of the open jaws, plus 3 mm."""
 _HEX = 2 / math.sqrt(3)
 """The ratio of a hexagon's width across corners to its width across flats."""
 
@@ -76,7 +79,8 @@ class PartError(ValueError):
 def ring(outer: float, inner: float, height: float) -> PartDesign:
     """Designs a bearing or a washer, in mm.
 
-    A ring of up to 70 mm is held across its outside, a larger one across its rim.
+    A ring with an outer diameter of up to 70 mm is held across its outside. A larger ring is held
+    across its rim.
     """
     if not 2.0 <= inner <= outer - 4.0:
         raise PartError(f"the bore must be 2 to {outer - 4:g} mm wide, and is {inner:g} mm")
@@ -139,7 +143,10 @@ def board(length: float, width: float, height: float) -> PartDesign:
     Its cavity is a rectangle, so the board also counts as placed when it is turned by a half turn.
     """
     if height < _FRAME + 1.0:
-        raise PartError(f"a board with its parts must be {_FRAME + 1:g} mm high or more")
+        raise PartError(
+            f"a board with its components must be at least {_FRAME + 1:g} mm high, and is "
+            f"{height:g} mm"
+        )
     base = _prism(_rectangle(length, width), _FRAME)
     parts = [Part("board", "green_grip", base.solid, base.hulls)]
     # Add a connector at one end, a chip and a smaller component, so that the board has no symmetry.
@@ -191,7 +198,7 @@ def pin(length: float, diameter: float) -> PartDesign:
         Part("shank", "steel", shank.solid, shank.hulls),
     ]
     x = _middle_of_mass(parts)[0]
-    # The pads of a short pin touch its collar, which is wider than its shank.
+    # On a short pin, the pads touch the collar, which is wider than the shank.
     on_collar = x + _PAD / 2 > length / 2 - collar
     return PartDesign(parts, PartGrasp((1.7 if on_collar else 1.0) * diameter, diameter, x), 1)
 
@@ -245,7 +252,7 @@ def bracket(length: float, width: float, height: float) -> PartDesign:
     # The fingers close beside the short leg.
     x = min(_middle_of_mass(parts)[0], length / 2 - thick - 12.0)
     if x < -length / 2:
-        raise PartError("its long leg is too short for the jaws")
+        raise PartError(f"its long leg of {length:g} mm is too short for the jaws")
     return PartDesign(parts, PartGrasp(thick, height, x, (thick - width) / 2), 1)
 
 
@@ -258,8 +265,10 @@ class PartKind:
     """The names of the dimensions, for messages."""
     default: tuple[float, ...]
     scaled: Callable[[float, float, float], tuple[float, ...]]
-    """A function that returns the dimensions of a part of a given length. Two further numbers from
-    0 to 1 vary its shape."""
+    """A function that returns the dimensions of a part of a given length.
+
+    Its other two arguments are numbers from 0 to 1 that vary the part's shape.
+    """
     longest: float = LONGEST_MM
     shortest: float = SHORTEST_MM
 
@@ -423,7 +432,7 @@ def _prism(profile: np.ndarray, height: float) -> Shape:
 
 
 def _around(profile: np.ndarray) -> CrossSection:
-    """Returns a square that contains a profile about the origin, so that it becomes one hull."""
+    """Returns a square that contains every profile. As the only cell, it makes one hull."""
     return CrossSection.square((2 * LONGEST_MM, 2 * LONGEST_MM), True)
 
 
@@ -443,10 +452,8 @@ def _turn(angle: float) -> np.ndarray:
 
 
 def _sectors(outer: float, inner: float) -> list[CrossSection]:
-    """Returns cells that divide a ring; their inner edges are chords of the bore."""
+    """Returns cells that divide a ring into sectors. Their inner edges are chords of the bore."""
     angles = 2 * np.pi * np.arange(_SECTORS + 1) / _SECTORS
-    # Put the corners of the chords on the bore's circle. Chords that touch the bore from outside
-    # would fill it.
     unit = np.column_stack([np.cos(angles), np.sin(angles)])
     middle = np.column_stack(
         [np.cos(angles[:-1] + np.pi / _SECTORS), np.sin(angles[:-1] + np.pi / _SECTORS)]

@@ -1,6 +1,6 @@
 """Generates pliers: two crossed levers on a rivet. They lie flat with the jaws toward +x."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -70,7 +70,8 @@ def _typed(kind: type, value: Any, field: str) -> Any:
     try:
         return kind(**value) if isinstance(value, dict) else value
     except TypeError as error:
-        raise UserError(f"pliers: {field}: {error}") from error
+        known = ", ".join(f.name for f in fields(kind))
+        raise UserError(f"pliers: {field} may only have the fields {known}") from error
 
 
 def build_pliers(p: PliersParameters) -> list[Part]:
@@ -180,7 +181,7 @@ def _jaw_profile(p: PliersParameters) -> np.ndarray:
         depth = 0.38 * radius * np.sin(angle) + (p.tooth_depth_mm if i % 2 else 0.0)
         bite.append((middle + radius * np.cos(angle), gap(middle) + depth))
     bite += [(pipe_start - 2.0, gap(pipe_start)), (start - 6.0, 0.2)]
-    # The points run clockwise over the back to the tip, and return along the edge that bites.
+    # `back` and `bite` run clockwise: over the back to the tip, and along the biting edge.
     return np.array([*back, *bite])[::-1].copy()
 
 

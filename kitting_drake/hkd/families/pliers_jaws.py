@@ -18,7 +18,8 @@ Line = list[tuple[float, float]]
 class Jaws:
     """A pair of jaws. Lengths in mm of the full-size tool with the rivet at the origin."""
 
-    # The shape of the upper jaw, a key of OUTLINES, and that of the lower jaw (empty: the same).
+    # The shapes of the upper and the lower jaw, keys of OUTLINES. An empty `lower_kind` stands for
+    # the shape of the upper jaw.
     kind: str = "combination"
     lower_kind: str = ""
     length_mm: float = 46.0
@@ -48,7 +49,16 @@ def upper_jaw(j: Jaws, start: float, half: float, kind: str = "") -> np.ndarray:
 
 
 def bent(j: Jaws, outline: np.ndarray, start: float) -> np.ndarray:
-    """Returns an outline (n, 2) that is turned at the joint and bent along an arc from there."""
+    """Turns a jaw at the joint and bends it along an arc from there.
+
+    Args:
+        j: the jaws, with the angles.
+        outline: the outline (n, 2) of a straight jaw.
+        start: the x at which the jaw leaves the joint.
+
+    Returns:
+        The outline (m, 2) of the bent jaw, with more points.
+    """
     if not j.turn_deg and not j.bend_deg:
         return outline
     # Subdivide the edges, because straight edges must bend as well.

@@ -73,7 +73,7 @@ def build_levers(v: Levers, j: Jaws) -> list[Part]:
     upper, lower = _lever(v, j, True), _lever(v, j, False)
     steel = Part("steel", v.steel_material, upper + lower, _steel_hulls(v, j))
     rivet = _rivet(v)
-    # The rivet's head needs no hull where the sleeves are higher.
+    # The rivet's head needs no hull if the sleeves are higher than it.
     hidden = v.grip_length_mm and v.grip_thickness_mm > v.thickness_mm + 2.6
     parts = [Part("rivet", v.rivet_material, rivet.solid, [] if hidden else rivet.hulls), steel]
     if v.grip_length_mm:
@@ -108,8 +108,10 @@ def _even(path: np.ndarray, step: float) -> np.ndarray:
 
 
 def _band(v: Levers, bare_only: bool) -> np.ndarray:
-    """Returns the outline of the steel handle at y < 0: the whole, or only the part outside the
-    sleeve."""
+    """Returns the outline of the steel handle at y < 0.
+
+    If `bare_only` is set, the part inside the sleeve is left out.
+    """
     path = _even(handle_path(v), 4.0)
     if bare_only and v.grip_length_mm:
         path = path[path[:, 0] > v.grip_length_mm - v.handle_length_mm - 9.0]
@@ -211,7 +213,7 @@ def _edge_bevel(v: Levers, j: Jaws) -> Manifold:
 
 
 def _steel_hulls(v: Levers, j: Jaws) -> list[np.ndarray]:
-    """Returns few convex prisms that fill the steel and its small gaps."""
+    """Returns a few convex prisms that cover the steel and fill its small gaps."""
     z = v.thickness_mm / 2
     band, lap = _band(v, True), _lap_outline(v)
     outlines = [
@@ -238,10 +240,10 @@ def slab_hulls(
     flanks: Sequence[tuple[float, float, float]] = (),
     tolerance: float = 0.24,
 ) -> list[np.ndarray]:
-    """Returns few convex prisms for a plate with a bevelled lower rim; holes and gaps are filled.
+    """Returns a few convex prisms that cover a plate with a bevelled lower rim.
 
-    The profile is cut across x into bands, each as long as possible. The hulls of a band's pieces
-    may exceed the profile by the tolerance.
+    Holes and narrow gaps in the plate are filled. The profile is cut across x into bands, each as
+    long as possible, and each piece of a band is replaced by its convex hull.
 
     Args:
         profile: the outline of the plate, in mm.

@@ -35,7 +35,7 @@ class Locking:
     # The depths of the body and of the handle, as seen from above.
     body_depth_mm: float = 15.0
     handle_depth_mm: float = 12.0
-    # The distance of the handle's outer edge from the body's at the end of the tool.
+    # The distance between the outer edges of the body and of the handle at the end of the tool.
     spread_mm: float = 52.0
     screw_diameter_mm: float = 13.0
     body_material: str = "polished_steel"
@@ -44,7 +44,7 @@ class Locking:
 
 
 def _outlines(k: Locking) -> dict[str, np.ndarray]:
-    """The outlines (n, 2) of the flat parts, in mm in the design frame."""
+    """Returns the outlines (n, 2) of the flat parts by name, in mm in the design frame."""
     half, end = k.flank_width_mm / 2, -k.body_length_mm
     body_inner = half - k.body_depth_mm
     body = fillet(

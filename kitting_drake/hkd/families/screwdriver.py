@@ -153,8 +153,7 @@ def _offset_driver(p: ScrewdriverParameters) -> list[Part]:
         path = [((0.0, 0.0), 0.0), *((tuple(q), a) for q, a in zip(turn, bend, strict=True))]
         sections = [across_path(bar, point, angle) for point, angle in path]
         for share, width, thick in ((0.3, 1.0, 0.7), (0.85, 1.0, 0.22), (1.0, 1.0, 0.18)):
-            # One tip is upright and the other flat, as on real tools, whose tips are used
-            # alternately.
+            # One tip is upright and the other one is flat, as on real offset screwdrivers.
             profile = bar * ((thick, width) if side > 0 else (width, thick))
             sections.append(
                 across_path(profile, (half, radius + share * (reach - radius)), bend[-1])

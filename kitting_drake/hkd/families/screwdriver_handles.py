@@ -24,11 +24,12 @@ class HandleSection(NamedTuple):
 
 
 class Zone(NamedTuple):
-    """A length of a handle of one material: `grip`, `accent` or `metal`."""
+    """A part of a handle's length that has one material."""
 
+    # The kind of material: grip, accent or metal.
     material: str
     stations: Sequence[HandleSection]
-    # Whether it is smooth except for fine rings, which the hulls can ignore.
+    # Whether the zone has fine rings, which its hulls ignore.
     knurled: bool = False
 
 
@@ -244,7 +245,10 @@ del S
 def handle(
     style: str, length: float, width: float, height: float, flute: float
 ) -> list[tuple[str, Shape]]:
-    """Builds the zones of a handle as (material, shape), with its front at x = 0. Lengths in mm.
+    """Builds the zones of a handle, with the handle's front at x = 0. Lengths in mm.
+
+    Returns:
+        The kind of material and the shape of each zone.
 
     Raises:
         ValueError: the style is not known.

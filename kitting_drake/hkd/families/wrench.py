@@ -2,7 +2,8 @@
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from typing import Any
 
 import numpy as np
 from manifold3d import CrossSection, Manifold
@@ -46,10 +47,15 @@ class WrenchParameters:
     material: str = "polished_steel"
 
     def __post_init__(self) -> None:
-        if isinstance(self.front, dict):
-            self.front = Head(**self.front)
-        if isinstance(self.back, dict):
-            self.back = Head(**self.back)
+        self.front, self.back = _head(self.front, "front"), _head(self.back, "back")
+
+
+def _head(value: Head | dict[str, Any], name: str) -> Head:
+    try:
+        return Head(**value) if isinstance(value, dict) else value
+    except TypeError as error:
+        known = ", ".join(f.name for f in fields(Head))
+        raise ValueError(f"{name} may only have the fields {known}") from error
 
 
 def build_wrench(p: WrenchParameters) -> list[Part]:
@@ -61,7 +67,7 @@ def build_wrench(p: WrenchParameters) -> list[Part]:
     for head, side in ((p.front, 1), (p.back, -1)):
         if head.neck_mm and not p.swing_mm:
             shank += _shoulders(p, head, side)
-    # Round the transitions between shank and heads in one outline; thicker heads are added below.
+    # Round the transitions between shank and heads in one outline. Thicker heads are added later.
     outline = blend(front.profile + shank + back.profile, p.blend_radius_mm)
     outline = outline - front.cut - back.cut
     bevel = p.bevel_mm if p.shank_bevel_mm is None else p.shank_bevel_mm
@@ -85,7 +91,7 @@ def build_wrench(p: WrenchParameters) -> list[Part]:
 def _slab(
     profile: CrossSection, thickness: float, bevel: float, cells: Sequence[CrossSection]
 ) -> Shape:
-    # Round the corners that are sharper than the bevel, because the bevel would fold over them.
+    # Round sharp corners first, because the bevel would fold over itself there.
     profile = blend(profile, 0.3, 1.4 * bevel)
     return plate(profile, -thickness / 2, thickness / 2, bevel, cells)
 
@@ -107,9 +113,10 @@ def _shoulders(p: WrenchParameters, head: Head, side: int) -> CrossSection:
 
 
 def _shank_cells(p: WrenchParameters) -> list[CrossSection]:
-    """Returns regions that cut the shank into convex parts; none unless both heads are simple.
+    """Returns regions that cut the shank into convex parts.
 
-    Where a thicker head covers the shank, that part belongs to the head.
+    The part of the shank that a head covers is left to the head. The list is empty if a head that
+    is no tail or spike has no shoulders.
     """
     half, far = p.center_distance_mm / 2, 100.0
     if p.swing_mm:

@@ -62,13 +62,15 @@ class HeadShape:
     cut: CrossSection
     # Separate parts that replace forged material: jaws, screws and rings.
     inserts: list[Part] = field(default_factory=list)
-    # Regions that cut the head into convex parts for collision. If there are none, triangles are
-    # used.
+    # Regions that cut the head into convex parts for collision. If there are none, the head is cut
+    # into triangles.
     cells: list[CrossSection] = field(default_factory=list)
 
 
 def head_shape(head: Head, x: float, heading_deg: float, bevel_mm: float) -> HeadShape:
-    """Returns the head at (x, 0); its axis is `heading_deg` plus the head's own angle from +x.
+    """Returns the shape of a head whose centre is at (x, 0).
+
+    The head's axis is turned from +x by `heading_deg` plus the head's own angle.
 
     Raises:
         ValueError: the kind of head is not known.
