@@ -50,14 +50,17 @@ def load_catalogue(path: Path) -> list[ToolEntry]:
     except yaml.YAMLError as error:
         raise CatalogueError(f"{path}: {' '.join(str(error).split())}") from error
     if not isinstance(data, dict) or not isinstance(data.get("tools"), list):
-        raise CatalogueError(f"{path}: it must hold a list named `tools`")
+        raise CatalogueError(f"{path}: the file must hold a list named `tools`")
     entries: list[ToolEntry] = []
     for item in data["tools"]:
         name = item.get("name", f"number {len(entries) + 1}")
         try:
             entries.append(ToolEntry(**{**item, "grasp": GraspEntry(**item["grasp"])}))
         except (KeyError, TypeError) as error:
-            raise CatalogueError(f"{path}: tool {name}: {error}") from error
+            raise CatalogueError(
+                f"{path}: tool {name} must have the fields name, category, split, length_mm and "
+                "grasp, and may have parameters; the grasp may have x_mm, y_mm and theta_deg"
+            ) from error
         if entries[-1].category not in CATEGORIES:
             raise CatalogueError(
                 f"{path}: tool {name}: category {entries[-1].category!r} is not one of "

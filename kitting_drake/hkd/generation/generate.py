@@ -73,8 +73,8 @@ class Report:
     bottom_error_mm: float
     top_error_mm: float
     grip_error_mm: float
-    # The variation of the gripped faces along the pads, and how far the tool stands out beyond them
-    # at the fingers.
+    # The variation of the gripped faces along the pads, and how far the tool between the fingers
+    # stands out beyond the gripped faces.
     grip_flatness_mm: float
     finger_overhang_mm: float
     # The tilt of the stable pose relative to the design's pose.
@@ -88,7 +88,8 @@ def build_parts(entry: ToolEntry) -> list[Part]:
     known = {f.name for f in dataclasses.fields(parameters_type)}
     if unknown := sorted(set(entry.parameters) - known):
         raise CatalogueError(
-            f"tool {entry.name}: {parameters_type.__name__} has no field {unknown[0]!r}"
+            f"tool {entry.name}: a tool of the category {entry.category} has no parameter "
+            f"{unknown[0]!r}"
         )
     try:
         parts = build(parameters_type(**entry.parameters))
@@ -115,7 +116,7 @@ def rest_rotation(points: np.ndarray, center_of_mass: np.ndarray) -> np.ndarray:
     """Returns R_TD (3, 3), the rotation to the stable pose nearest to the design's pose.
 
     Args:
-        points: (n, 3) in the design frame D; the body's convex hull is theirs.
+        points: points (n, 3) in the design frame D whose convex hull is that of the body.
         center_of_mass: (3,) in D, in the unit of the points.
     """
     poses = stable_poses(points, center_of_mass)
@@ -226,8 +227,10 @@ def _collision_hulls(
 
 
 def _allowed(outline: CrossSection, grasp: GraspEntry) -> CrossSection:
-    """Returns the region that collision hulls may cover: the outline and a margin, small at the
-    grip."""
+    """Returns the region that collision hulls may cover: the outline and a margin around it.
+
+    The margin is smaller where the jaws grip.
+    """
 
     def grown(distance: float) -> CrossSection:
         return outline.offset(distance, JoinType.Round, circular_segments=96)
@@ -261,7 +264,7 @@ class _GripReport:
     width: float
     # The variation of the gripped faces along the pads.
     flatness: float
-    # How far the tool stands out beyond the gripped faces at the fingers.
+    # How far the tool between the fingers stands out beyond the gripped faces.
     overhang: float
     # The height of the tool's top at the grasp.
     top: float

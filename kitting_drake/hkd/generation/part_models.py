@@ -63,7 +63,7 @@ def sized_part(kind: str, length: float, shares: tuple[float, float]) -> Tool:
         shares: two numbers from 0 to 1 that vary the part's proportions.
 
     Raises:
-        UserError: there is no such part.
+        UserError: the dimensions do not make a part that the hand can hold.
     """
     known = PART_KINDS[kind]
     length_mm = min(max(1e3 * length, known.shortest), known.longest)

@@ -35,15 +35,15 @@ from kitting_drake.hkd.tools.tool import Tool
 Array = NDArray[np.float64]
 
 _LENGTHS, _SHORT, _LONG = (0.11, 0.23), (0.05, 0.11), (0.23, 0.32)
-"""Ranges of the tools' lengths, in metres: usual, short and long tools. The share of short tools is
-`_UNUSUAL`, and so is that of long ones."""
+"""The ranges of the lengths of usual, short and long tools, in metres."""
 _UNUSUAL = 0.12
+"""The share of short tools, which is also the share of long tools."""
 _HIGHEST = 0.046
 """The largest height that fits into a kit's block, in metres."""
 _COMPOSED, _PARTS = 0.2, 0.3
 """The share of tools that are composed of simple solids, and the share of simple parts."""
 _JITTER = 0.22
-"""The logarithm of the largest factor for each length and angle of a design."""
+"""The logarithm of the largest factor by which a length or an angle of a design changes."""
 _REFINED = 6.0
 """The longest edge of the triangles before the warp, in mm."""
 _SIMPLIFIED = 0.08
@@ -151,7 +151,7 @@ def _draw_length(rng: np.random.Generator) -> float:
 
 
 def _varied(entry: ToolEntry, rng: np.random.Generator) -> ToolEntry:
-    """Returns a design with random proportions, also for those at their default values."""
+    """Returns a design with random proportions. Those with default values vary as well."""
     defaults = DESIGNS[entry.category][0]()
     parameters = {
         key: value for key, value in vars(defaults).items() if isinstance(value, float)
@@ -176,19 +176,21 @@ def _jittered(key: str, value: Any, rng: np.random.Generator, spread: float) -> 
 
 @dataclass(frozen=True)
 class _Warp:
-    """A map of points (n, 3) in mm. It stretches and widens the tool across its axis x, and then
-    bends it."""
+    """A random deformation of points (n, 3) in mm.
+
+    It stretches the tool along y and z, widens it toward one end, and bends it sideways.
+    """
 
     low: float
-    """The x of the tool's lower end, in mm."""
+    """The least x of the tool, in mm."""
     length: float
+    """The length of the tool along x, in mm."""
     stretch: Array
     """The factors (2,) along y and z."""
     splay: float
-    """The factor by which the forward end is wider than the middle, minus 1."""
+    """The factor by which the end toward +x is wider than the middle, minus 1."""
     bend: Array
-    """The coefficients (2,) of the square and the cube of x, measured from the middle in half
-    lengths."""
+    """The coefficients (2,) of u^2 and u^3, where u is -1 and 1 at the ends of the tool."""
 
     @classmethod
     def draw(cls, solid: Manifold, rng: np.random.Generator) -> "_Warp":
@@ -215,8 +217,7 @@ def _centroid(solid: Manifold) -> Array:
 
 
 def _composed(rng: np.random.Generator) -> Manifold:
-    """Composes a shaft along x with one to four solids at its ends or along it, in mm, lying
-    flat."""
+    """Draws a lying shaft along x with one to four solids at its ends or between them, in mm."""
     length = 180.0
     width, height = rng.uniform(6, 30), rng.uniform(5, 28)
     solid = _bar(length, width, height, rng)
@@ -234,7 +235,7 @@ def _composed(rng: np.random.Generator) -> Manifold:
                 outer * rng.uniform(0.35, 0.75), 40
             )
             item = ring.extrude(tall).translate((0, 0, -tall / 2))
-            # The shaft ends at the ring.
+            # Put the ring just beyond the end of the shaft.
             place = math.copysign(length / 2 + 0.8 * outer, place)
         elif kind == "fork":
             spread, long = rng.uniform(8, 25), rng.uniform(20, 60)
