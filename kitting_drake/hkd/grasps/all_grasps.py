@@ -21,16 +21,16 @@ _FORMAT_VERSION = "1"
 """The version of the files in the cache. Increase it when equal tools give different grasps."""
 _FILE = "grasps.json"
 _EASY_MOMENT = 0.18
-"""The moment about the axis of the pads that they hold easily, in N m."""
+"""The moment about the axis through both pads that the grip holds easily, in N m."""
 _WORST = 12.5
-"""The cost above which proposals are left out."""
+"""The cost (`GraspProposal.cost`) above which proposals are left out."""
 
 
 def all_grasps(tool: Tool) -> tuple[Grasp, ...]:
     """Returns the annotated grasp and then the proposals, best first.
 
-    Computing proposals takes a second or two, so they are kept in the cache. For a scaled tool, the
-    original's proposals are scaled.
+    Computing proposals takes a second or two, so they are stored in the cache. The proposals of a
+    scaled tool are those of the unscaled tool, scaled.
 
     Raises:
         UserError: a mesh or the model cannot be read, or the cache cannot be written.
@@ -61,9 +61,9 @@ def all_grasps(tool: Tool) -> tuple[Grasp, ...]:
 def carrying_grasps(tool: Tool) -> tuple[Grasp, ...]:
     """Returns the grasps by which to carry a tool, best first.
 
-    These are usually the tool's own grasps. If the tool's weight would turn it between the pads in
-    the first of them, they are the grasps of `all_grasps`, ordered by the moment of the weight that
-    the pads cannot hold.
+    These are the tool's own grasps if the tool's weight does not turn it between the pads in the
+    first of them. Otherwise, these are the grasps of `all_grasps`, ordered by the moment of the
+    weight that exceeds what the pads hold.
 
     Raises:
         UserError: as for `all_grasps`.

@@ -1,9 +1,9 @@
 """Grasps of tools without two parallel faces: by a corner, or by a taper.
 
-A soft pad yields to a corner. If there is a face on the other side, the pads close where the tool's
-width is least, and squeezing turns the face flat onto its pad. If there is a notch on the other
-side, its two ends touch the pad. Where the tool tapers along the pads, the ends of the pads hold
-it, and friction keeps it from slipping out.
+A soft pad yields to a corner. If there is a face on the other side of the tool, the closing pads
+turn the tool until this face lies flat on its pad. If there is a notch on the other side, the two
+ends of the notch touch the pad. Where the tool tapers along the pads, the ends of the pads hold the
+tool, and friction keeps it from slipping out.
 """
 
 import numpy as np
@@ -16,15 +16,16 @@ LEAST_WIDTH = 0.008
 
 # The depth to which a corner sinks into a pad, in metres.
 _SOFT = 0.0008
-# A corner opposite a face is held firmly if the face supports the pad over `_CORNER_MARGIN`, in
-# metres, to either side of the corner. Two opposite corners are held if they are offset along the
-# pads by at most `_CORNER_OFFSET`.
+# A corner opposite a face is held if the face touches its pad over at least `_CORNER_MARGIN` (m) on
+# both sides of the corner. Two opposite corners are held if they are offset along the pads by at
+# most `_CORNER_OFFSET` (m).
 _CORNER_MARGIN, _CORNER_OFFSET = 0.002, 0.0005
-# A taper is held if its faces lean by at most this slope, measured over this length in metres.
+# A taper is held if the slope of its faces along the pads is at most `_TAPER`, measured over
+# `_TAPER_LENGTH` (m).
 _TAPER, _TAPER_LENGTH = float(np.tan(np.radians(24.0))), 0.004
-# The costs of three kinds of holds: a corner against a face, plus an amount if the corner touches
-# only part of a pad; a taper, plus an amount for its slope; and two opposite corners, between which
-# the tool may turn.
+# A corner opposite a face costs `_CORNER_COST`, and up to `_NOT_FLAT_COST` more the less of the pad
+# the face touches. A taper costs `_TAPER_COST`, and up to `_SLOPE_COST` more the steeper it is. Two
+# opposite corners, between which the tool may turn, cost `_TWO_CORNERS_COST`.
 _CORNER_COST, _NOT_FLAT_COST = 0.5, 2.0
 _TAPER_COST, _SLOPE_COST = 0.8, 0.5
 _TWO_CORNERS_COST = 2.5
@@ -38,8 +39,9 @@ def corner_cost(left: Array, right: Array, column: float, touch: float) -> float
     forces of the pads then act along one line.
 
     Args:
-        left: (columns, levels) the position of the surface under the left pad, in metres.
-        right: (columns, levels) the position of the surface under the right pad, in metres.
+        left: (columns, levels) the coordinate, along the closing direction, of the surface under
+            the left pad, in metres.
+        right: (columns, levels) the same coordinate of the surface under the right pad.
         column: the length of a column, in metres.
         touch: the depth behind the foremost point, in metres, up to which a flat face touches a
             pad.

@@ -22,6 +22,7 @@ class Grip:
     """The least coordinate along the closing direction, measured from the point (x, y) of
     `find_grip`."""
     high: float
+    """The greatest coordinate along the closing direction, measured from the same point."""
     top: float
     """The greatest height of the surface between the jaws."""
 
@@ -65,8 +66,11 @@ def jaw_axes(theta: float) -> tuple[Array, Array]:
 
 
 def _points_between(triangles: Array, normal: Array, distance: float) -> Array:
-    """Clips triangles (n, 3, 3) to |normal . p| <= distance; returns the corners (m, 3) of the
-    rest."""
+    """Clips triangles (n, 3, 3) to |normal . p| <= distance.
+
+    Returns:
+        The corners (m, 3) of what remains.
+    """
     starts, ends = triangles.reshape(-1, 3), np.roll(triangles, -1, axis=1).reshape(-1, 3)
     start_heights, end_heights = starts @ normal, ends @ normal
     found = [starts[np.abs(start_heights) <= distance]]

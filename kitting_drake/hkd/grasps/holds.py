@@ -1,6 +1,6 @@
-"""How two pads hold a tool, from the tool's extents to either side at each height.
+"""Finds how two pads can hold a tool, from the tool's extents to the left and right at each height.
 
-Coordinates are the hand's: u is along the pads, v across them. Lengths are in metres.
+The coordinate u is along the pads, and v is across them. Lengths are in metres.
 """
 
 from collections.abc import Iterator
@@ -25,19 +25,19 @@ BIN = 0.0005
 
 # The distance by which the upper fingers are set back from the pads.
 _FINGER_RECESS = 0.003
-# The inward lean of a face above which it slips out of the pads, in radians.
+# The largest inward lean, in radians, of a face that does not slip out of the pads.
 _STEEPEST = np.radians(28.0)
-# The least share of the pads' length along which both must touch, except at a corner.
+# The least share of the pads' length along which both pads must touch, except at a corner.
 _LEAST_CONTACT = 0.15
 
-# The number of columns to either side of the middle.
+# The numbers of columns in half the length of the pads, and in half the length of the fingers.
 _PAD_COLUMNS = round(PAD_LENGTH / 2 / BIN)
 FINGER_COLUMNS = round(FINGER_LENGTH / 2 / BIN)
 
 
 @dataclass(frozen=True)
 class Reach:
-    """The extents of a tool to either side at each height, at one rotation of the hand."""
+    """The extents of a tool to the left and right at each height, for one rotation of the hand."""
 
     u_min: float
     """The u of the first column; each column is `BIN` long."""
@@ -71,7 +71,7 @@ def reach_of(points: Array, level: NDArray[np.int64], levels: Array, theta: floa
     """Returns the extents of a tool at one rotation of the hand.
 
     Args:
-        points: (n, 2) on the outlines of the tool's horizontal slices.
+        points: points (n, 2) on the outlines of the tool's horizontal slices.
         level: (n) the index of each point's slice.
         levels: (levels) the heights of the slices, equally spaced.
         theta: the rotation of the hand, in radians.
@@ -168,8 +168,8 @@ def _between_fingers(
     """Keeps the columns where the open fingers have room on both sides of the tool.
 
     Returns:
-        The columns (n); and between the fingers the greatest and the least v at each level,
-        (n, levels) both.
+        The columns (n) that are kept; and the greatest v and the least v (n, levels) of the tool
+        between the fingers.
     """
     fingers = centres[:, None] + np.arange(-FINGER_COLUMNS, FINGER_COLUMNS)
     left, right = reach.left[fingers].max(axis=1), reach.right[fingers].min(axis=1)
@@ -181,11 +181,13 @@ def _between_fingers(
 def _contact(
     touch_left: NDArray[np.bool_], touch_right: NDArray[np.bool_], at_corner: bool
 ) -> tuple[float, float]:
-    """Returns the mean number of touching levels, and the distance between the mean contacts.
+    """Returns the mean number of levels that touch, and the offset between the mean contacts.
+
+    The offset is along the pads, in metres.
 
     Args:
         touch_left: (columns, levels) where the left pad touches.
-        touch_right: the same for the right one.
+        touch_right: (columns, levels) where the right pad touches.
         at_corner: whether the pads touch in different columns.
     """
     columns_left, columns_right = touch_left.any(axis=1), touch_right.any(axis=1)

@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 
 # Lengths are in metres.
 PLANNER = PickPlaceParameters()
-"""The default planner, for which tools are annotated and kits laid out."""
+"""The default parameters of the planner, for which tools are annotated and kits are laid out."""
 GRASP_DEPTH = PLANNER.grasp_depth
 """The depth of the pads' lower edges below the tool's top."""
 FLOOR_CLEARANCE = PLANNER.floor_clearance
@@ -36,8 +36,8 @@ FLOOR_CLEARANCE = PLANNER.floor_clearance
 RELEASE_REACH = PLANNER.release_clearance + FINGERTIP_DEPTH
 """The distance beyond the gripped faces that the fingertips need when they release."""
 
-# A pad touches the surface up to this depth behind the foremost point: first in the fine search,
-# then in the coarse one.
+# The depth behind the foremost point up to which a pad touches the surface, in the fine search and
+# in the coarse search.
 _TOUCH = 0.0003
 _COARSE_TOUCH = 0.0008
 # The distance from the middle of a tool in its kit to a neighbouring tool.
@@ -46,7 +46,8 @@ _LANE = 0.040
 _STEP = 0.001
 _COARSE_DEG, _FINE_DEG = 5.0, 0.5
 _MOST_PROPOSALS = 12
-# A proposal is dropped if it is this close to a better one.
+# A proposal is dropped if both its distance (m) and its rotation (rad) from a better one are less
+# than this.
 _DISTINCT, _DISTINCT_ANGLE = 0.012, np.radians(20.0)
 
 
@@ -63,14 +64,14 @@ class GraspProposal(Grasp):
     slope: float
     """The inward lean of the gripped faces at the pads' lower edges, in radians."""
     overhang: float
-    """The distance by which the tool stands out beyond the gripped faces at the fingers, in
+    """The distance by which the tool between the fingers stands out beyond the gripped faces, in
     metres."""
     penalties: dict[str, float] = field(default_factory=dict)
-    """The terms of the cost, by cause."""
+    """The terms of the cost, by their causes."""
 
     @property
     def cost(self) -> float:
-        """The sum of the penalties, which ranks proposals; above 3 is poor."""
+        """The sum of the penalties, by which proposals are ranked. A cost above 3 is poor."""
         return sum(self.penalties.values())
 
     @property
@@ -86,7 +87,7 @@ def propose_grasps(
     *,
     corners: bool = False,
 ) -> list[GraspProposal]:
-    """Proposes grasps from above, best first; returns none if the hand cannot hold the tool.
+    """Proposes grasps from above, best first. The list is empty if the hand cannot hold the tool.
 
     A triangle, a pentagon or a star has no two parallel faces for the pads, and is held at a
     corner. The soft pad yields to the corner, and the face or the two points under the other pad
@@ -132,7 +133,7 @@ def _propose(
             )
         if near:
             result.append(min(near, key=lambda p: p.cost))
-    # The slices resolve heights only to their spacing.
+    # Measure heights on the triangles, because the slices resolve them only to their spacing.
     result = [replace(p, surface_height=_top(triangles, p)) for p in result]
     return sorted(result, key=lambda p: p.cost)
 
