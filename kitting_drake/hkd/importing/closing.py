@@ -15,12 +15,11 @@ _FLAT_MM = 2.0
 def capped(vertices: Array, faces: Faces) -> Faces | None:
     """Closes the openings of a surface with flat caps.
 
-    Openings in the same plane are closed together. A rim inside another therefore stays a hole, and
-    a ring stays a ring.
+    Openings in the same plane are closed together, so a rim inside another rim stays a hole.
 
     Args:
-        vertices: (n, 3), in mm, for a surface about 180 mm long.
-        faces: (m, 3), consistently wound.
+        vertices: the vertices (n, 3) in mm, for a surface about 180 mm long.
+        faces: the triangles (m, 3), consistently wound.
 
     Returns:
         The triangles (k, 3) of the surface and the caps. None if an opening is not flat or its rim

@@ -1,4 +1,4 @@
-"""Covers an outline, within a tolerance, with few convex polygons. Lengths in mm."""
+"""Covers an outline, within a tolerance, with a few convex polygons. Lengths in mm."""
 
 import numpy as np
 from manifold3d import CrossSection, OpType
@@ -6,14 +6,14 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-# Area (mm^2) below which two outlines count as equal.
+# The difference in area (mm^2) up to which two outlines count as equal.
 _AREA = 0.02
 # The number of points through which to try a cut, and the number of angles at each point.
 _CORNERS, _ANGLES = 6, 8
 _FAR = 1e3
 # Cells smaller than `_SMALLEST_MM` are not cut again. Cutting stops at `_MOST_CELLS` cells.
 _SMALLEST_MM, _MOST_CELLS = 1.0, 150
-# Steps by which the edges of the final polygons are moved outward, in turn.
+# The steps by which the edges of the final polygons are moved outward, in this order.
 _PUSHES_MM = (0.8, 0.4, 0.2, 0.1)
 
 
@@ -111,7 +111,10 @@ def _notches(part: CrossSection) -> list[Array]:
 
 
 def _grown(seed: int, cells: list[CrossSection], outer: CrossSection) -> set[int]:
-    """Grows a hull within `outer` from one cell, by the least added area; returns its cells."""
+    """Grows a hull within `outer` from the cell `seed` and returns the indices of its cells.
+
+    Each step adds the cell with which the hull covers the least area outside the cells.
+    """
     hull, members, candidates = cells[seed].hull(), {seed}, set(range(len(cells))) - {seed}
     while True:
         trials = []
@@ -162,7 +165,7 @@ def _between(normals: Array, offsets: Array) -> CrossSection:
 
 
 def _needed(polygons: list[CrossSection], inner: CrossSection) -> list[CrossSection]:
-    """Drops the polygons that the others make superfluous, smallest first."""
+    """Drops polygons without which `inner` is still covered, the smallest first."""
     kept = list(polygons)
     for polygon in sorted(polygons, key=CrossSection.area):
         rest = [other for other in kept if other is not polygon]

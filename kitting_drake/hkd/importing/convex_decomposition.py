@@ -32,7 +32,7 @@ volume."""
 _MOST_VERTICES = 20
 _VERTEX_TOLERANCES_MM = (0.2, 0.3, 0.45, 0.6)
 _OUTLINE_VERTEX_TOLERANCE_MM = 0.08
-# Half the width of the notches that hulls may bridge. Cavities bridge them too.
+# Half the width of the notches that hulls may bridge, because cavities bridge these notches, too.
 _NOTCH_MM = 2.0
 _SMALLEST_VOLUME = 0.5
 
@@ -71,7 +71,7 @@ def decompose(solid: Manifold, grasp: Grasp) -> Decomposition:
         try:
             hulls.append(_thinned(np.asarray(part.hull().to_mesh64().vert_properties)[:, :3]))
         except QhullError:
-            # Rounding to the grid may leave a part without volume.
+            # Rounding may leave a part without volume.
             continue
     hulls.sort(key=lambda hull: tuple(np.round(hull.mean(axis=0), 3)))
     return Decomposition(hulls, _deviation(hulls, outline))
@@ -144,8 +144,11 @@ def _halves(part: Manifold) -> tuple[Manifold, Manifold]:
 
 
 def _steps(shares: np.ndarray) -> list[float]:
-    """Returns positions (0 to 1) of planes that hold many vertices, such as a shoulder or a jaw's
-    end."""
+    """Returns positions (0 to 1) of planes with many vertices, such as a shoulder or a jaw's end.
+
+    Args:
+        shares: the positions (n) of the vertices, from 0 to 1.
+    """
     within = shares[(shares > 0.08) & (shares < 0.92)]
     values, counts = np.unique(np.round(within, 3), return_counts=True)
     order = np.argsort(-counts, kind="stable")[:3]

@@ -17,6 +17,7 @@ from kitting_drake.hkd.tools.tool import LONGEST_MM, SHORTEST_MM, Tool
 from systems.grasp import Grasp
 
 THINNEST_MM, HIGHEST_MM = 4.0, 45.0
+"""The least and the largest height of a tool at rest."""
 
 # The number of other grasps to keep, and how much more than the best grasp they may cost.
 _OTHERS, _MUCH_WORSE = 3, 2.0
@@ -113,13 +114,13 @@ def _check_size(solid: Manifold) -> None:
     length, _, height = size(solid)
     if height < THINNEST_MM:
         raise UserError(
-            f"at a length of {length:.0f} mm it is {height:.1f} mm thick (the hand needs "
-            f"at least {THINNEST_MM:.0f} mm)"
+            f"at a length of {length:.0f} mm the tool is {height:.1f} mm thick, but the hand needs "
+            f"at least {THINNEST_MM:.0f} mm"
         )
     if height > HIGHEST_MM:
         raise UserError(
-            f"at a length of {length:.0f} mm it is {height:.0f} mm high at rest (a kit has room "
-            f"for {HIGHEST_MM:.0f} mm)"
+            f"at a length of {length:.0f} mm the tool is {height:.0f} mm high at rest, but a kit "
+            f"has room for at most {HIGHEST_MM:.0f} mm"
         )
 
 

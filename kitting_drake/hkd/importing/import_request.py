@@ -26,25 +26,25 @@ class ImportRequest:
     mesh: Path
     category: str
     name: str | None = None
-    """The tool's name; None takes the file's name."""
+    """The tool's name. None: the file's name."""
     length_mm: float | None = None
-    """The length in mm to scale to; None keeps the true length."""
+    """The length in mm to which the tool is scaled. None: the length in the file."""
     unit: str | None = None
-    """The unit of the file, a key of `fit.UNITS_MM` or, for outlines, of `drawn_curves.UNITS_MM`;
-    None finds the unit."""
+    """The unit of the file, a key of `fit.UNITS_MM` or, for outlines, of `drawn_curves.UNITS_MM`.
+    None: the unit is taken from the file or found by `fit.true_length`."""
     mass_g: float | None = None
-    """The weighed mass in grams; None computes it from the densities."""
+    """The weighed mass in grams. None: the mass is computed from the densities."""
     material: str | None = None
     """The material of the whole tool, a key of `materials.MATERIALS`."""
     density: float | None = None
-    """The mean density in kg/m^3; None takes that of the category (see `materials`)."""
+    """The mean density in kg/m^3. None: the density of the category (see `materials`)."""
     output: Path | None = None
-    """The folder of tools to write to; None: `user_tools`."""
+    """The folder of tools to write to. None: `user_tools`."""
     height_mm: float | None = None
     """The height in mm to which an outline is extruded. A mesh has none."""
     frame: str | None = None
-    """What a rectangle around the rest of an outline is, one of `closed_curves.FRAMES`; None
-    decides it where it is clear."""
+    """Whether a rectangle around all other curves of a drawing is the page or the tool: one of
+    `closed_curves.FRAMES`. None: the user is asked if this is not clear."""
 
     @property
     def given_density(self) -> float | None:
@@ -108,5 +108,7 @@ def checked_name(request: ImportRequest) -> str:
             f"--name '{name}' must consist of lower-case letters, digits and underscores"
         )
     if name in tool_names():
-        raise UserError(f"'{name}' is the name of one of the project's own tools: give --name")
+        raise UserError(
+            f"'{name}' is the name of one of the project's own tools: give another --name"
+        )
     return name

@@ -47,8 +47,8 @@ def read_drawing(path: Path, unit_mm: float | None = None, frame: str | None = N
         path: the path of the drawing.
         unit_mm: the length in mm of a unit of the drawing; None takes the unit from the file (see
             `svg_curves` and `dxf_curves`).
-        frame: what a rectangle around all else is, `page` or `tool`; None decides it where it is
-            clear.
+        frame: whether a rectangle around all other curves is the `page` or the `tool`; None: this
+            is decided if it is clear.
 
     Raises:
         UserError: the file is missing or not a drawing, its size is unknown, a curve is open, or
@@ -78,7 +78,7 @@ def laid_along_x(
     """Rotates an outline so that its length is along x, and scales it on request.
 
     Args:
-        outline: in mm.
+        outline: the outline, in mm.
         length_mm: the length to scale to; None keeps the scale.
         name: the outline's name in messages.
 

@@ -35,7 +35,9 @@ def prepare_aside(request: ImportRequest, name: str, made: Path, time_limit: flo
     try:
         while True:
             if not ours.poll(MOST_WAITING * TIME_LIMIT):
-                raise UserError(f"{request.mesh} hung while {step}: decimate the mesh first")
+                raise UserError(
+                    f"the import of {request.mesh} hung while {step}: decimate the mesh first"
+                )
             said, error, result = ours.recv()
             if said is None:
                 break
@@ -44,12 +46,11 @@ def prepare_aside(request: ImportRequest, name: str, made: Path, time_limit: flo
         process.join()
         if process.exitcode == -signal.SIGXCPU:
             raise UserError(
-                f"{request.mesh} took more than {time_limit:.0f} s of processor time, the last of "
-                f"it while {step}: decimate the mesh first"
+                f"the import of {request.mesh} took more than {time_limit:.0f} s of processor time "
+                f"and was stopped while {step}: decimate the mesh first"
             ) from end
         raise UserError(
-            f"{request.mesh} cannot be processed: the import crashed while {step}; repair the "
-            "mesh first"
+            f"the import of {request.mesh} crashed while {step}: repair the mesh first"
         ) from end
     finally:
         process.kill()

@@ -36,10 +36,10 @@ from kitting_drake.hkd.tools.tool import Tool, load_tool
 _SAME_POSE_DEG, _LAYINGS = 2.0, 3
 # A stable tool stays upright when the table is tilted by this angle, in degrees.
 _TIPS_DEG = 10.0
-# The hydroelastic modulus, in Pa. With the catalogue's, the pads would sink too far into thin
-# blades and slide up round handles.
+# The hydroelastic modulus, in Pa. With the modulus of the catalogue's tools, the pads would sink
+# too far into thin blades and slide up round handles.
 _MODULUS = 8e6
-# The deviation of the collision hulls from the outline above which the user is told, in mm.
+# The deviation of the collision hulls from the outline above which a note reports it, in mm.
 _TRUE_OUTLINE_MM = 0.35
 Prepared = tuple[dict[str, Any], list[str], int]
 Say = Callable[[str], None]
@@ -134,7 +134,7 @@ def _prepare(request: ImportRequest, name: str, directory: Path, say: Say) -> Pr
         solid = fitted.transform(np.column_stack([tilt, np.zeros(3)]))
         length = request.length_mm or size(solid)[0]
         laid = [f"laid in its resting pose, which is tilted by {angle:.0f} degrees"]
-    # The tool keeps no pose, so use the one with the lowest centre of mass.
+    # The tool did not come to rest in any of these poses, so use the first one.
     _empty(directory)
     notes.append("it rolls on a table")
     return _write(request, name, directory, first, wanted, notes, say)[0]
@@ -181,7 +181,11 @@ def _write(
     notes: list[str],
     say: Say,
 ) -> tuple[Prepared, Manifold]:
-    """Writes the files of a solid (in mm, in the tool frame); also returns the scaled solid."""
+    """Writes the files of a solid that is in mm in the tool frame.
+
+    Returns:
+        The results of `prepare_tool`, and the solid scaled to `length` mm.
+    """
     notes = list(notes)
     category, density = request.category, request.given_density
     say("finding a grasp")
@@ -244,7 +248,7 @@ def _write(
 def _properties(
     tool: Tool, mass: float, center: NDArray[np.float64], symmetry: int
 ) -> dict[str, Any]:
-    """Returns a tool's record, without the part on the file that it comes from."""
+    """Returns a tool's record without the entry `imported`."""
     return {
         "name": tool.name,
         "category": tool.category,

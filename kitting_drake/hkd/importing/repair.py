@@ -1,9 +1,10 @@
 """Turns any mesh into one solid, the first step of `hkd import`.
 
-A watertight mesh is used as it is. Any other mesh is split into connected components. Each
-component is repaired alone: its winding, then small holes, then flat openings, and the rest by
-pymeshfix. The components are then united, and sealed hollows are subtracted. If visible parts are
-lost, the surface is filled as voxels, and the surface of the voxels is traced.
+A watertight mesh is used as it is. Any other mesh is split into connected components, and each
+component is repaired separately. First its winding is repaired, then small holes and flat openings
+are closed. If this does not suffice, pymeshfix repairs the component. The components are then
+united, and sealed hollows are subtracted. If visible parts are lost, the surface is filled as
+voxels, and the surface of the voxels is traced.
 """
 
 import numpy as np
@@ -29,15 +30,15 @@ _GAP_MM, _DIRT = 1.5, 0.02
 _LOST = 0.03
 # The size of a pixel of the compared projections.
 _PIXEL_MM = 0.5
-# If repair adds more than the share `_TELLING` of the surface, the user is told. The repaired
+# If repair adds more than the share `_TELLING` of the surface, a note reports it. The repaired
 # surface is sampled at `_PROBES` points; a point counts as added if it is farther than `_AWAY_MM`
 # from the given surface.
 _TELLING, _AWAY_MM, _PROBES = 0.03, 1.5, 20_000
 _MOST_COMPONENTS = 3000
 _VOXEL_MM = 0.75
-# The largest share of a hollow's volume outside its body.
+# The largest share of a hollow's volume that may lie outside the body around it.
 _OUTSIDE = 0.01
-# A mesh that fills a smaller share of its bounding box counts as one without volume.
+# The share of its bounding box below which a mesh counts as one without volume.
 _HOLLOW = 0.002
 
 Array = NDArray[np.float64]
@@ -204,8 +205,10 @@ def _fixed(fixer: pymeshfix.PyTMesh) -> Manifold | None:
 
 
 def _loses(triangles: Array, solid: Manifold) -> bool:
-    """Whether visible parts of triangles (n, 3, 3) are missing from a solid in any of three
-    projections."""
+    """Whether a solid lacks visible parts of triangles (n, 3, 3), or has many more.
+
+    The projections of both along x, y and z are compared.
+    """
     if solid.is_empty():
         return True
     mesh = solid.to_mesh64()

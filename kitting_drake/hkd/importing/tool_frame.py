@@ -100,11 +100,10 @@ def _lowest_pose(vertices: Array, com: Array) -> StablePose:
 
 
 def long_direction_deg(outline: CrossSection) -> float:
-    """Returns the direction of an outline's length: that of most of its edges, near its principal
-    axis.
+    """Returns the direction of an outline's length.
 
-    The long edges of a handle therefore count more than a head or a jaw that sticks out to one
-    side.
+    This is the direction near the principal axis in which most of the outline's edges run. The long
+    edges of a handle therefore count more than a head or a jaw that sticks out to one side.
 
     Args:
         outline: an outline about 180 mm long.
@@ -123,8 +122,7 @@ def long_direction_deg(outline: CrossSection) -> float:
     directions = axis + np.arange(-_SIDEWAYS_DEG, _SIDEWAYS_DEG, 0.25)
     apart = (directions[:, None] - angles + 90.0) % 180.0 - 90.0
     votes = np.exp(-0.5 * (apart / _LIKE_DEG) ** 2) @ lengths
-    # Average the directions of the edges that agree with the winner, which is finer than the
-    # search's steps.
+    # Average the directions of the edges near the best one, which is finer than the search's steps.
     near = apart[int(np.argmax(votes))]
     weights = lengths * np.exp(-0.5 * (near / _LIKE_DEG) ** 2)
     return float(directions[int(np.argmax(votes))] - np.average(near, weights=weights))

@@ -23,25 +23,25 @@ PAPERS_MM = (
 )
 """Names of sheets of paper, and their sides in mm."""
 FRAMES = ("page", "tool")
-"""What a rectangle around the rest of a drawing may be."""
+"""What a rectangle around all other curves of a drawing may be."""
 
 _JOIN_MM = 0.1
 """The largest gap between the ends of two curves that are joined, in mm."""
 _POINT_MM = 0.002
-"""A smaller curve is a point."""
+"""The size in mm up to which a curve counts as a point, which is dropped."""
 _SAME_MM = 0.05
-"""The distance in mm within which a curve counts as a second drawing of another."""
+"""The distance in mm up to which two curves count as one curve that is drawn twice."""
 _LEAST_AREA_MM2 = 1.0
 _LINE_MM = 1.5
 """The width in mm below which two outlines count as the two sides of one thick line."""
 _BOX = 0.9
-"""A rectangle, also one with round corners, fills at least this share of its bounds."""
+"""The least share of its bounding box that a rectangle fills, even if its corners are round."""
 _THE_PAGE = "the page"
 _PAGE = 0.85
-"""The least share of the page's sides that a rectangle of the page has."""
+"""The least ratio of a rectangle's sides to the page's sides if the rectangle is the page."""
 _HOLE, _TOOL = 0.25, 0.4
-"""Shares of a rectangle's length. A curve in it that is shorter than the first is a hole; one that
-is longer than the second may be a tool."""
+"""Shares of a rectangle's length. A curve in the rectangle that is shorter than `_HOLE` is a hole,
+and a curve that is longer than `_TOOL` may be a tool."""
 _ROUND = 0.02
 """The largest relative difference of a round hole from a circle."""
 
@@ -49,7 +49,7 @@ Points = NDArray[np.float64]
 
 
 class FrameError(UserError):
-    """A rectangle may be a frame, or the tool."""
+    """Raised if it is not clear whether a rectangle is a frame or the tool."""
 
 
 @dataclass(frozen=True)
@@ -58,36 +58,39 @@ class _Loop:
 
     area: CrossSection
     element: int | None
-    """The number of its filled element, as in `Curve`."""
+    """The number of the curve's filled element, as in `Curve`."""
 
     @property
     def size(self) -> Points:
-        """The lengths (2,) of its sides along x and y, in mm."""
+        """The extents (2,) of the curve along x and y, in mm."""
         x_min, y_min, x_max, y_max = self.area.bounds()
         return np.array([x_max - x_min, y_max - y_min])
 
     @property
     def is_round(self) -> bool:
-        """Whether it is a circle."""
+        """Whether the curve is a circle."""
         across = self.size.mean()
         square = abs(self.size[0] - self.size[1]) < _ROUND * across
         return bool(square and abs(self.area.area() / (np.pi / 4 * across**2) - 1) < _ROUND)
 
     def holds(self, other: "_Loop") -> bool:
-        """Whether another curve lies inside it."""
+        """Whether another curve lies inside this curve."""
         return bool((other.area - self.area).area() < 0.01 * other.area.area())
 
 
 def enclosed(
     drawn: DrawnCurves, path: Path, frame: str | None = None
 ) -> tuple[CrossSection, list[str]]:
-    """Returns the area inside the largest closed curve and outside the others, and notes.
+    """Returns the outline of a tool, and notes for the user.
+
+    Pages and frames are left out first. The outline is then the area inside the largest closed
+    curve and outside the other curves.
 
     Args:
         drawn: the curves.
         path: the drawing, for messages.
-        frame: what a rectangle around all else is, one of `FRAMES`; None decides it where it is
-            clear.
+        frame: whether a rectangle around all other curves is the page or the tool, one of `FRAMES`;
+            None: this is decided if it is clear.
 
     Raises:
         FrameError: the largest curve may be a frame.
@@ -108,8 +111,8 @@ def enclosed(
     outer, *holes = areas
     parts = sorted(outer.decompose(), key=lambda part: -part.area())
     if sum(part.area() for part in parts[1:]) > _LEAST_AREA_MM2:
-        raise UserError(f"{path}: its outline crosses itself")
-    # Lines that overshoot a corner leave specks.
+        raise UserError(f"{path}: its outline crosses itself: draw it without crossings")
+    # Drop the tiny areas that lines enclose where they overshoot a corner.
     outer = parts[0]
     for hole in holes:
         if (hole - outer).area() > 0.01 * hole.area():
@@ -135,19 +138,19 @@ def _as_frame(
 
     Args:
         loops: closed curves, the largest first; at least two.
-        page_mm: the size of the page, where the drawing has one.
+        page_mm: the size of the page, if the drawing has one.
         path: the drawing, for messages.
         frame: as in `enclosed`.
 
     Raises:
-        FrameError: it may be either.
+        FrameError: the largest curve may be a frame or the tool.
     """
     box, inside, *others = loops
     sides = box.size
     if (
         frame == "tool"
         or box.area.area() < _BOX * sides.prod()
-        # The rectangle drawn twice, or the inner side of its line.
+        # The second curve is the rectangle drawn again, or the inner side of its thick line.
         or box.area.area() < 1.02 * inside.area.area()
         or (box.area.offset(-_LINE_MM, JoinType.Miter) - inside.area).area()
         < 0.001 * box.area.area()
@@ -158,7 +161,7 @@ def _as_frame(
     page = _page_of(sides, page_mm)
     if frame == "page":
         return f"{size}, {page or 'a frame'},"
-    # A filled element shows its inner curves as holes.
+    # The inner curves of a filled element are holes.
     if inside.element is not None and inside.element == box.element:
         return None
     share = float(inside.size.max() / sides.max())
@@ -167,7 +170,7 @@ def _as_frame(
     )
     if sides.max() > LONGEST_MM:
         return f"{size}, {page or 'a frame'}," if share >= _TOOL else None
-    # Lines as large as the page may be those of a tool that the page was fitted to.
+    # A rectangle as large as the page may also be a tool to which the page was fitted.
     is_ground = page is not None and (
         page != _THE_PAGE or None not in (box.element, inside.element)
     )
@@ -177,13 +180,13 @@ def _as_frame(
         return None
     inner = f"{inside.size[0]:.0f} x {inside.size[1]:.0f} mm"
     raise FrameError(
-        f"{path} has {size} around a curve of {inner}: give --frame page if the tool is what is "
-        "inside, or --frame tool if it is the rectangle, with a hole"
+        f"{path} has {size} around a curve of {inner}: give --frame page if the inner curve is the "
+        "tool, or --frame tool if the rectangle is the tool and the inner curve is a hole"
     )
 
 
 def _page_of(sides: Points, page_mm: tuple[float, float] | None) -> str | None:
-    """Names the page that is as large as a rectangle with these sides (2,), if one is."""
+    """Returns the name of the page or sheet of paper with these sides (2,) in mm, or None."""
     share = np.zeros(2) if page_mm is None else sides / page_mm
     if ((share >= _PAGE) & (share <= 1 / _PAGE)).all():
         return _THE_PAGE
@@ -194,7 +197,10 @@ def _page_of(sides: Points, page_mm: tuple[float, float] | None) -> str | None:
 
 
 def _joined(drawn: DrawnCurves, path: Path, notes: list[str]) -> list[tuple[Points, int | None]]:
-    """Joins curves whose ends meet into closed curves; also returns the element of each.
+    """Joins curves whose ends meet into closed curves.
+
+    Returns:
+        The points (n, 2) of each closed curve in mm, and its element (see `Curve`).
 
     Raises:
         UserError: a curve stays open.
@@ -228,7 +234,7 @@ def _joined(drawn: DrawnCurves, path: Path, notes: list[str]) -> list[tuple[Poin
             chain = np.concatenate(parts)
         if not _is_closed(chain):
             if np.ptp(chain, axis=0).max() <= 2 * _JOIN_MM:
-                # Left over where other pieces met.
+                # Ignore a short piece that is left over where other pieces met.
                 continue
             area = abs(CrossSection([chain], FillRule.EvenOdd).area())
             if not filled or area < _LEAST_AREA_MM2:
@@ -241,7 +247,7 @@ def _joined(drawn: DrawnCurves, path: Path, notes: list[str]) -> list[tuple[Poin
 
 
 def _gap_error(chains: list[Points], drawn: DrawnCurves, path: Path) -> UserError:
-    """Returns the error for open curves, with the smallest gap between their ends and its place."""
+    """Returns an error that names the smallest gap between the ends of open curves."""
     ends = np.array([end for chain in chains for end in (chain[0], chain[-1])])
     gaps = np.linalg.norm(ends[:, None] - ends, axis=2)
     gaps[gaps <= _JOIN_MM] = np.inf
@@ -273,7 +279,7 @@ def _merged_lines(curves: list[Curve]) -> list[Curve]:
             places = np.sort(offsets @ along, axis=1)
             overlap = np.minimum(places[:, 1], length) - np.maximum(places[:, 0], 0.0)
             shorter = np.minimum(places[:, 1] - places[:, 0], length)
-            # Do not merge short pieces of a curve, because they are neighbours.
+            # Use smaller limits for short lines, so that neighbouring pieces of a curve stay apart.
             slack = np.minimum(_SAME_MM, 0.2 * shorter)
             beside = np.abs(offsets @ np.array([-along[1], along[0]])).max(axis=1)
             least = np.minimum(2 * _JOIN_MM, 0.5 * shorter)
@@ -304,8 +310,8 @@ def _without_doubles(curves: list[Points]) -> list[int]:
         for other in around[within.all(axis=1)]:
             if other not in trees:
                 trees[other] = cKDTree(_dense(curves[other], _SAME_MM))
-            # Half a step of the dense points is added to the distance. A short piece of a curve
-            # is close to its neighbours.
+            # Add half the spacing of the points on the other curve. Use a smaller limit for a short
+            # piece of a curve, which is close to its neighbours.
             near = min(1.2 * _SAME_MM, 0.5 * _SAME_MM + 0.2 * lengths[index])
             if trees[other].query(places)[0].max() <= near:
                 break
@@ -328,5 +334,5 @@ def _is_closed(curve: Points) -> bool:
     if len(curve) < 3:
         return False
     gap = float(np.linalg.norm(curve[-1] - curve[0]))
-    # A short piece of a curve ends near its start, too.
+    # Use a smaller limit for a short piece of a curve, whose ends are always close.
     return gap <= min(_JOIN_MM, 0.3 * float(np.ptp(curve, axis=0).max()))

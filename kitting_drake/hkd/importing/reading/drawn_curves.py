@@ -28,8 +28,11 @@ class Curve:
     filled: bool = False
     """Whether the drawing fills the curve. A filled curve looks closed even if it is open."""
     element: int | None = None
-    """The number of the filled element that it is a part of; others of that element are holes.
-    None: not filled, or not known."""
+    """The number of the filled element to which the curve belongs.
+
+    The curves of one element that lie inside another of its curves are holes. None: the curve is
+    not filled, or its element is not known.
+    """
 
 
 @dataclass(frozen=True)

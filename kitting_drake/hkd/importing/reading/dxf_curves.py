@@ -15,12 +15,15 @@ from kitting_drake.hkd.tools.tool import LONGEST_MM, SHORTEST_MM
 _NOTES = ("DIMENSION", "ARC_DIMENSION", "LARGE_RADIAL_DIMENSION", "LEADER", "MULTILEADER")
 """DXF entities that annotate a drawing, so their lines do not belong to an outline."""
 _SMOOTHED, _CONTROL_POINT = 4, 16
-"""Flags of polylines and of their vertices."""
+"""The flags of a smoothed polyline, and of a vertex that is only a control point."""
 _MORE_UNITS_MM = {8: 25.4e-6, 9: 0.0254, 21: 1200 / 3937 * 1e3, 22: 100 / 3937 * 1e3}
 """Values of $INSUNITS that ezdxf does not convert: microinches, mils, US survey feet and inches."""
 
 _END_MARK, _TAIL = re.compile(rb"^\s*EOF\b", re.MULTILINE), 1000
-"""The end mark of a DXF; some programs write more bytes behind it."""
+"""The end mark of a DXF, and the number of last bytes in which it is sought.
+
+Some programs write more bytes behind the end mark.
+"""
 
 
 def dxf_curves(path: Path, unit_mm: float | None = None) -> DrawnCurves:
@@ -71,7 +74,7 @@ def dxf_curves(path: Path, unit_mm: float | None = None) -> DrawnCurves:
     except (MemoryError, UserError):
         raise
     except Exception as error:
-        raise UserError(f"{path} cannot be read as DXF") from error
+        raise UserError(f"{path} cannot be read as DXF: export it again") from error
     if not curves and elsewhere:
         raise UserError(
             f"{path} has its curves in paper space ('{elsewhere[0]}'): move them to model space"
@@ -83,7 +86,7 @@ def dxf_curves(path: Path, unit_mm: float | None = None) -> DrawnCurves:
 
 
 def _document(ezdxf: Any, path: Path) -> Any:
-    """Reads a DXF. A file that lacks only the end mark is complete.
+    """Reads a DXF. A file that lacks only the end mark counts as complete.
 
     Raises:
         UserError: the file is cut short.
@@ -136,8 +139,12 @@ def _scale(
 
 
 def _likely(path: Path, document: Any, extent: float) -> tuple[float, str]:
-    """Returns the only unit in which a drawing without one has a tool's length; mm if there is
-    none.
+    """Chooses the unit of a drawing that states none.
+
+    This is the only unit in which the drawing is as long as a tool, or mm if there is none.
+
+    Returns:
+        The length of the unit in mm, and a phrase for the user.
 
     Raises:
         UserError: there are several such units.

@@ -84,4 +84,5 @@ def _scene(path: Path) -> tuple[Array, Faces]:
         raise
     except Exception as error:
         # The readers raise many types of errors on broken files.
-        raise UserError(f"{path} cannot be read as {path.suffix[1:].upper()}") from error
+        kind = path.suffix[1:].upper()
+        raise UserError(f"{path} cannot be read as {kind}: export it again") from error

@@ -42,6 +42,6 @@ def write_outline_picture(outline: CrossSection, path: Path) -> None:
 
 
 def holes_text(outline: CrossSection) -> str:
-    """Says in words how many holes an outline has."""
+    """Returns the number of holes of an outline in words, such as "2 holes"."""
     holes = outline.num_contour() - len(outline.decompose())
     return "no hole" if not holes else f"{holes} {'hole' if holes == 1 else 'holes'}"

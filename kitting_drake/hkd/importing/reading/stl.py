@@ -60,7 +60,7 @@ def _is_text(data: bytes) -> bool:
 
 def _text_triangles(data: bytes, path: Path) -> NDArray[np.float64]:
     data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
-    # The name of a solid may be any words; it stands on a line of its own.
+    # Match whole lines, because the line with the name of a solid may hold any words.
     facets = len(_FACET.findall(data))
     corners = _VERTEX.findall(data)
     if len(corners) != 3 * facets:

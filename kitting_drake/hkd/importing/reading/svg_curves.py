@@ -69,7 +69,7 @@ def svg_curves(path: Path, unit_mm: float | None = None) -> DrawnCurves:
         raise
     except Exception as error:
         # The reader raises many types of errors on broken files.
-        raise UserError(f"{path} cannot be read as SVG") from error
+        raise UserError(f"{path} cannot be read as SVG: export it again") from error
     return DrawnCurves(curves, measured, page)
 
 
@@ -92,8 +92,7 @@ def _read_style(root: ElementTree.Element) -> None:
 
 
 def _scale(root: ElementTree.Element, text: bytes, unit_mm: float | None) -> tuple[float, str]:
-    """Returns the length in mm of svgelements' pixel (1/96 inch if lengths have units), and the
-    reason.
+    """Returns the length in mm of a pixel of svgelements, and a phrase that says how it is known.
 
     Raises:
         UserError: the drawing has no size, and its scale cannot be inferred.
@@ -118,8 +117,8 @@ def _scale(root: ElementTree.Element, text: bytes, unit_mm: float | None) -> tup
         if paper and abs(25.4 / dpi / paper_mm - 1) > 1e-6:
             raise UserError(
                 f"{writer} writes pixels of 1/{dpi} inch, but the page has the size of {paper}: "
-                f"give --length_mm, or set width and height in mm ({25.4 / dpi * sides[1]:.0f} mm "
-                f"or {paper_mm * sides[1]:.0f} mm)"
+                f"give --length_mm, or set width and height in mm (the longer of the two is "
+                f"{25.4 / dpi * sides[1]:.0f} mm or {paper_mm * sides[1]:.0f} mm)"
             )
         return 25.4 / dpi, f"by pixels of 1/{dpi} inch, as {writer} writes them"
     if paper:
@@ -138,7 +137,7 @@ def _scale(root: ElementTree.Element, text: bytes, unit_mm: float | None) -> tup
 
 
 def _paper(sides: list[float]) -> tuple[str, float]:
-    """Finds the sheet of paper, and the unit, for which a page's sides match a standard format.
+    """Finds the standard sheet of paper whose size a page has in some unit.
 
     Args:
         sides: the page's sides in units, the shorter first.

@@ -51,7 +51,10 @@ def read_3mf(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     try:
         with zipfile.ZipFile(path) as archive:
             if sum(item.file_size for item in archive.infolist()) > _MOST_BYTES:
-                raise UserError(f"{path} unpacks to more than {_MOST_BYTES / 1e6:.0f} MB")
+                raise UserError(
+                    f"{path} unpacks to more than {_MOST_BYTES / 1e6:.0f} MB: decimate the mesh "
+                    "first"
+                )
             main = _main_part(archive)
             root = ElementTree.fromstring(archive.read(main))
             objects: dict[tuple[str, str], _Object] = {}
@@ -63,10 +66,12 @@ def read_3mf(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     except UserError:
         raise
     except (zipfile.BadZipFile, KeyError, ElementTree.ParseError, ValueError) as error:
-        raise UserError(f"{path} cannot be read as 3MF") from error
+        raise UserError(f"{path} cannot be read as 3MF: export it again") from error
     mm = _UNITS_MM.get(root.get("unit", "millimeter"))
     if mm is None:
-        raise UserError(f"{path} is in '{root.get('unit')}', which is not a unit of 3MF")
+        raise UserError(
+            f"{path} has the unit '{root.get('unit')}': give one of {', '.join(_UNITS_MM)}"
+        )
     meshes = [
         mesh
         for item in _all(root, "item")
@@ -74,7 +79,7 @@ def read_3mf(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         for mesh in _placed(objects, _reference(item, main, names), _transform(item), _DEEPEST)
     ]
     if not meshes:
-        raise UserError(f"{path} builds no object")
+        raise UserError(f"{path} has no solid object to print: export it again")
     starts = np.cumsum([0, *(len(vertices) for vertices, _ in meshes)])
     faces = [faces + start for (_, faces), start in zip(meshes, starts, strict=False)]
     return mm * np.vstack([vertices for vertices, _ in meshes]), np.vstack(faces)

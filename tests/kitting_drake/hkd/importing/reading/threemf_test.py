@@ -114,5 +114,5 @@ def test_what_cannot_be_read_is_said(name: str, content: bytes, token: str, tmp_
     with pytest.raises(UserError, match=token):
         read_mesh(tmp_path / name)
     empty = package(tmp_path / "empty.3mf", {"3D/3dmodel.model": model(mesh_object(1), "")})
-    with pytest.raises(UserError, match="builds no object"):
+    with pytest.raises(UserError, match="no solid object"):
         read_mesh(empty)
