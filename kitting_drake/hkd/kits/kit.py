@@ -54,7 +54,7 @@ class Kit:
         return self.parameters.length, self.parameters.width, self.parameters.height
 
     def goal(self, index: int) -> CavityPose:
-        """The goal pose of tool `index`'s frame T in K."""
+        """The goal pose in K of the frame T of the tool with this index."""
         return self.layout.poses[index]
 
 

@@ -73,8 +73,10 @@ def slot_pose(tool: Tool, parameters: KitParameters) -> CavityPose:
 
 
 def _floor(tool: Tool, parameters: KitParameters) -> float:
-    """The height, in the kit frame and in metres, of the floor of a tool's cavity. On this floor,
-    the tool's top is `stand_out` above the block's top."""
+    """Returns the height of the floor of a tool's cavity in the kit frame, in metres.
+
+    On this floor, the tool's top is `stand_out` above the block's top.
+    """
     return parameters.height - tool.height + parameters.stand_out
 
 
@@ -84,7 +86,7 @@ def cavity_outline(outline: CrossSection, parameters: KitParameters) -> CrossSec
     Holes are filled, because they would leave thin pillars in the cavity.
     """
     closing, clearance = parameters.closing_radius, parameters.clearance
-    # Simplify only at the start and the end: each time may move the outline by the tolerance.
+    # Simplify only at the start and the end, because each simplification may move the outline.
     grown = outline.simplify(parameters.tolerance / 4).offset(
         closing + clearance, JoinType.Round, circular_segments=ARC_SEGMENTS
     )
@@ -178,7 +180,8 @@ def _nested_on_least_block(
     if nesting is None:
         sides = " by ".join(f"{1e3 * side:.0f}" for side in LONGEST_SIDES)
         raise UserError(
-            f"{_quoted(tools)} do not fit into one kit: its block can be at most {sides} mm"
+            f"{_quoted(tools)} do not fit into one kit, whose block can be at most {sides} mm: use "
+            "fewer tools"
         )
     return nesting
 
@@ -250,7 +253,7 @@ def moved_outline(outline: CrossSection, pose: CavityPose) -> CrossSection:
 
 
 def _has_walls(cavities: Sequence[Cavity], parameters: KitParameters) -> bool:
-    """Whether walls of the least thickness fit between all cavities and to the block's sides."""
+    """Whether the walls between cavities and beside the block's sides are thick enough."""
     half_wall = parameters.minimum_wall / 2
     grown = [
         cavity.rim.offset(half_wall, JoinType.Round, circular_segments=ARC_SEGMENTS)

@@ -132,7 +132,7 @@ def nest_on(
     extents = [max(rotated[0].size) for rotated in parts]
     largest_first = sorted(range(len(shapes)), key=lambda i: -sizes[i])
     longest_first = sorted(range(len(shapes)), key=lambda i: -extents[i])
-    # The masks are conservative: shapes that overlap by a cell or two on the raster may still fit.
+    # The masks are conservative: shapes may fit even if the raster must be a cell or two larger.
     for order, lengthwise, excess in itertools.product(
         (largest_first, longest_first), (True, False), (0, 1, 2)
     ):
@@ -198,7 +198,11 @@ class _Part:
         self._spectra: dict[tuple[int, int], tuple[Spectrum, Spectrum]] = {}
 
     def spectra(self, canvas: tuple[int, int]) -> tuple[Spectrum, Spectrum]:
-        """Returns the conjugate spectra of the masks that are tested against other shapes."""
+        """Returns two conjugate spectra.
+
+        The first is of the cells that another shape's `solid` may not occupy, the second of those
+        that another shape's `keep_out` may not occupy.
+        """
         if canvas not in self._spectra:
             self._spectra[canvas] = (
                 np.conj(_transform(self.on_canvas(self.walled | self.keep_out, canvas, (0, 0)))),
@@ -311,7 +315,10 @@ def _lowest_place(
     strip: tuple[int, int],
     canvas: tuple[int, int],
 ) -> tuple[int, int] | None:
-    """The lowest, then leftmost, free (row, column) of a part's corner; None if there is none."""
+    """Returns the lowest free place (row, column) of a part's corner; None if there is none.
+
+    Of equally low places, it is the leftmost.
+    """
     rows, columns = strip[0] - part.size[0] + 1, strip[1] - part.size[1] + 1
     if rows <= 0 or columns <= 0:
         return None

@@ -20,21 +20,21 @@ class KitParameters:
     width: float = bounded(0.260, 0.04, 1.0)
     height: float = bounded(0.050, 0.01, 0.2)
 
-    # Free space between a seated tool's outline and the wall. Below 1 mm, the tools get collision
-    # hulls whose outlines are within 0.05 mm of the true ones, and the tolerance is at most a
-    # twentieth of the clearance.
+    # The clearance between a seated tool's outline and the wall. Below 1 mm, the tools get
+    # collision hulls whose outlines are within 0.05 mm of the true outlines, and `tolerance` is at
+    # most a twentieth of the clearance.
     clearance: float = bounded(0.002, 0.0, 0.01)
 
     # Clearances of single tools by name, instead of `clearance`.
     clearance_of: dict[str, float] = field(default_factory=dict, metadata={"range": (0.0, 0.01)})
 
-    # By how much the tops of seated tools stand out of the block's top; 0: flush.
+    # The height of the tops of seated tools above the block's top; 0: flush.
     stand_out: float = bounded(0.0, 0.0, 0.1)
 
-    # Radius of the morphological closing: notches narrower than twice this are bridged.
+    # The radius of the morphological closing, which bridges notches narrower than twice this.
     closing_radius: float = bounded(0.008, 0.0, 0.03)
 
-    # Width and depth of the bevel around the rim, which leads a tool in.
+    # The width and depth of the bevel around the rim, which leads a tool in.
     lead_in: float = bounded(0.001, 0.0, 0.005)
 
     # The largest deviation of the simplified outline from the exact wall.
@@ -63,12 +63,12 @@ class KitParameters:
         return self.least_clearance < TIGHT
 
     def of_tool(self, name: str) -> "KitParameters":
-        """Returns the parameters with the clearance of a tool."""
+        """Returns the parameters of one tool's cavity: the same, with this tool's clearance."""
         if name not in self.clearance_of:
             return self
         return replace(self, clearance=self.clearance_of[name], clearance_of={})
 
     def with_fine_walls(self) -> "KitParameters":
-        """Returns the parameters with a tolerance that suits the clearance, if that is tight."""
+        """Returns the parameters, with a finer tolerance if the clearance is tight."""
         finest = max(self.least_clearance / 20, _FINEST)
         return replace(self, tolerance=min(self.tolerance, finest)) if self.is_tight else self
