@@ -55,8 +55,10 @@ def _rounded(outline: CrossSection, radius: float) -> CrossSection:
 
 
 def _star(points: int, outer: float, inner: float) -> CrossSection:
-    """Draws a star with a point toward +y; if `inner` is on the sides of a polygon, it is that
-    polygon."""
+    """Draws a star with a point toward +y.
+
+    `outer` is the radius of the points, and `inner` that of the corners between them.
+    """
     angles = math.pi / 2 + np.arange(2 * points) * math.pi / points
     radii = np.where(np.arange(2 * points) % 2, inner, outer)
     return CrossSection([np.column_stack([radii * np.cos(angles), radii * np.sin(angles)])])

@@ -1,5 +1,6 @@
-"""Makes tools of flat shapes, in the cache: the project's own shapes, and the meshes of a folder.
+"""Makes tools from flat shapes: the project's own shapes, and the meshes in a folder.
 
+The tools are stored in the cache.
 A shape lies as it was drawn, with z up. All shapes are of plastic, each in its own colour. The
 collision hulls follow the outline and keep its holes.
 """
@@ -172,7 +173,8 @@ def _write(
     proposals = propose_grasps(triangles, center, corners=True)
     if not proposals:
         raise UserError(
-            f"the hand cannot hold it from above (the jaws open to at most {1e3 * WIDEST:.0f} mm)"
+            "the hand cannot hold the shape from above (the jaws open to at most "
+            f"{1e3 * WIDEST:.0f} mm)"
         )
     grasp = min(proposals, key=_rank).grasp
     meshes.write_smooth_obj(folder / f"{colour}.obj", solid, _CREASE_DEG)
@@ -213,22 +215,22 @@ def _check(solid: Manifold) -> None:
     length, width, height = size(solid)
     if max(length, width) > _LARGEST_MM:
         raise UserError(
-            f"it is {max(length, width):.0f} mm long, and a shape can have at most "
+            f"the shape is {max(length, width):.0f} mm long, and may have at most "
             f"{_LARGEST_MM:.0f} mm: give another scale"
         )
     if not THINNEST_MM <= height <= HIGHEST_MM:
         raise UserError(
-            f"it is {height:.1f} mm high, but the hand and a kit need {THINNEST_MM:.0f} to "
+            f"the shape is {height:.1f} mm high, but the hand and a kit need {THINNEST_MM:.0f} to "
             f"{HIGHEST_MM:.0f} mm: give another scale"
         )
     if tipping_deg(solid) < _TIPS_DEG:
         raise UserError(
-            "it does not lie flat: turn it so that its flat side is in the plane of x and y"
+            "the shape does not lie flat: turn the mesh so that its flat side is in the xy plane"
         )
 
 
 def _hulls(solid: Manifold, grasp: Grasp) -> list[np.ndarray]:
-    """Makes convex hulls (n, 3) in mm that fill a shape; those of a prism leave its holes open."""
+    """Makes convex hulls (n, 3) that fill a shape, in mm. The holes of a prism stay open."""
     height = float(size(solid)[2])
     outline = solid.project().simplify(0.01)
     prism = abs(outline.area() * height - solid.volume()) < _PRISM * solid.volume()
