@@ -1,8 +1,8 @@
 """Merges many small convex hulls that fill a solid into few collision hulls.
 
-Lengths are in mm. A hull is given by points (n, 3), whose convex hull it is. The projections of the
-result limit the merging: the xy outline decides whether the tool fits its cavity, and the xz and yz
-profiles decide how it rests.
+Lengths are in mm. A hull is given as points (n, 3), which stand for their convex hull. Merging must
+hardly change the projections of the tool: the xy outline decides whether the tool fits its cavity,
+and the xz and yz profiles decide how it rests.
 """
 
 import itertools
@@ -22,7 +22,7 @@ _XY, _XZ, _YZ = [0, 1], [0, 2], [1, 2]
 # A first pass merges hulls whose projections change by less than this, to leave fewer hulls for the
 # search.
 _EXACT_MM = 0.03
-# Area (mm^2) below which two outlines count as equal.
+# The difference in area (mm^2) up to which two outlines count as equal.
 _AREA = 1e-4
 
 
@@ -75,7 +75,7 @@ def thinned(
     to a grid. Facets that are nearly in one plane are then exactly in one plane or clearly not.
 
     Args:
-        points: (n, 3) in mm.
+        points: the points (n, 3), in mm.
         tolerance: the largest distance between the hulls, in mm.
         outline_tolerance: the tolerance for the outline from above, in mm; `tolerance` if None.
         grid: the spacing of the grid in mm.
@@ -93,8 +93,11 @@ def thinned(
 
 
 def _farthest(points: np.ndarray, chosen: list[int], tolerance: float) -> list[int]:
-    """Adds farthest points to `chosen` until the hull is within tolerance; returns sorted
-    indices."""
+    """Adds the farthest points to `chosen` until the hull is within the tolerance of all points.
+
+    Returns:
+        The indices of the chosen points, sorted.
+    """
     dimension = points.shape[1]
     directions = np.array(np.meshgrid(*[[-1.0, 0.0, 1.0]] * dimension)).reshape(dimension, -1).T
     chosen = list(dict.fromkeys([*chosen, *np.argmax(points @ directions.T, axis=0)]))
@@ -132,10 +135,10 @@ def _grown(profile: CrossSection, distance: float) -> CrossSection:
 
 
 def _fits(hull: _Hull, allowed: CrossSection, tolerance: float) -> bool:
-    """Whether a hull may be merged from its sources.
+    """Whether the hulls from which a hull was merged may be replaced by it.
 
-    Its xy projection must stay within `allowed`. Its other two projections may be larger than those
-    of its sources by at most `tolerance` (mm).
+    The hull's xy projection must stay within `allowed`. Its other two projections may extend beyond
+    those of its sources by at most `tolerance` (mm).
     """
     if (projection([hull.points]) - allowed).area() > _AREA:
         return False

@@ -1,7 +1,7 @@
 """Collision hulls that follow a tool's outline closely, for cavities with little clearance.
 
-Lengths are in mm. The outline from above is cut into convex cells. Each hull
-encloses the part of the solid that lies above one cell, so no hull sticks out beyond the outline.
+Lengths are in mm. The outline from above is cut into convex cells. Each hull encloses the part of
+the solid that lies above one cell, so no hull sticks out beyond the outline.
 """
 
 from collections.abc import Sequence
@@ -19,9 +19,9 @@ INSIDE_MM = 0.04
 NOTCH_MM = 3.0
 """Half the width of the notches that hulls may bridge, in mm. Cavities bridge them too."""
 _HEIGHT_MM = 0.2
-"""The tolerance in mm for thinning a hull's vertices; the outline has a finer one."""
+"""The tolerance in mm for thinning a hull's vertices; that for the outline is finer."""
 _AREA = 2e-3
-"""Area (mm^2) below which two outlines count as equal."""
+"""The difference in area (mm^2) up to which two outlines count as equal."""
 # A piece is cut at a height if the cut makes its hull smaller by more than the share `_SHARE` and
 # by more than `_VOLUME` (mm^3). `_LEVELS` is the number of heights to try, `_MOST_CUTS` the largest
 # number of cuts.

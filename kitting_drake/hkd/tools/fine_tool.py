@@ -18,8 +18,8 @@ from kitting_drake.hkd.tools.tool import Tool
 _FORMAT_VERSION = "3"
 """The version of the files in the cache. Increase it when equal inputs give different files."""
 _STIFFER = 25.0
-"""The factor for the hydroelastic modulus. It keeps walls from sinking in by more than the
-clearance."""
+"""The factor for the hydroelastic modulus. It keeps the kit's walls from sinking into the tool by
+more than the clearance."""
 _LIST = "hulls.json"
 _DRAKE = "http://drake.mit.edu"
 

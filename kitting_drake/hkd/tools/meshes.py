@@ -56,8 +56,8 @@ def flat_obj(
     """Returns the OBJ text of a mesh, with one normal per face on request.
 
     Args:
-        vertices: (n, 3), in metres.
-        faces: (m, 3).
+        vertices: the vertices (n, 3), in metres.
+        faces: the triangles (m, 3).
         digits: the number of decimals of the vertices.
         normal_digits: the number of decimals of the normals; None writes no normals.
     """
@@ -77,8 +77,7 @@ def flat_obj(
 
 
 def _rows(line: str, values: np.ndarray) -> str:
-    """Formats each row of an array (n, m). One format operation for all rows is three times as fast
-    as one for each."""
+    """Formats each row of an array (n, m), in one operation, which is three times as fast as n."""
     return (line * len(values)) % tuple(values.ravel().tolist())
 
 

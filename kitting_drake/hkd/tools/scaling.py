@@ -23,7 +23,7 @@ _FORMAT_VERSION = "1"
 """The version of the files in the cache. Increase it when equal inputs give different files."""
 _SAME_LENGTH = 1e-9
 _EASY_MOMENT = 0.2
-"""The moment about the axis of the pads that they hold easily, in N m."""
+"""The moment about the axis through both pads that the grip holds easily, in N m."""
 _WIDEST = MAX_OPENING - 0.015
 """The largest width of the tool's `other_grasps` after scaling, in metres."""
 
@@ -41,7 +41,10 @@ def scaled_tool(tool: Tool, length: float) -> Tool:
             written.
     """
     if not 0.0 < length < float("inf"):
-        raise UserError(f"the tool '{tool.name}' cannot be scaled to a length of {length:g} m")
+        raise UserError(
+            f"the tool '{tool.name}' cannot be scaled to a length of {length:g} m: give a positive "
+            "length"
+        )
     if abs(length - tool.length) <= _SAME_LENGTH:
         return tool
     factor = length / tool.length
@@ -79,7 +82,9 @@ def weighted_tool(tool: Tool, mass: float) -> Tool:
         UserError: the mass is not positive, the model is not valid, or the cache cannot be written.
     """
     if not 0.0 < mass < float("inf"):
-        raise UserError(f"the tool '{tool.name}' cannot have a mass of {mass:g} kg")
+        raise UserError(
+            f"the tool '{tool.name}' cannot have a mass of {mass:g} kg: give a positive mass"
+        )
     if mass == tool.mass:
         return tool
     text = model_text(tool.sdf, mass=mass / tool.mass)
@@ -101,8 +106,7 @@ def weighted_tool(tool: Tool, mass: float) -> Tool:
 
 
 def _excess_moment(grasp: Grasp, root: ElementTree.Element, mass: float) -> float:
-    """Returns how much the weight's moment about the axis of the pads exceeds `_EASY_MOMENT`, in N
-    m."""
+    """Returns by how much the weight's moment about the pads exceeds `_EASY_MOMENT`, in N m."""
     pose = root.findtext(".//inertial/pose") or "0 0"
     x, y, *_ = map(float, pose.split())
     lever = (x - grasp.x) * math.cos(grasp.theta) + (y - grasp.y) * math.sin(grasp.theta)
@@ -126,12 +130,12 @@ def _scaled_model(tool: Tool, factor: float) -> Path:
 
 
 def scaled_sdf(text: str, directory: Path, factor: float) -> str:
-    """Scales the SDFormat text of a model of meshes uniformly.
+    """Returns the SDFormat text of a uniformly scaled model. All of its geometry must be meshes.
 
     Args:
         text: the original text.
         directory: the folder to which the original's relative URIs refer; the result has absolute
-            ones.
+            URIs.
         factor: the scale.
 
     Raises:

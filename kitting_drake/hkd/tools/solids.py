@@ -71,7 +71,7 @@ class Shape(NamedTuple):
     hulls: list[np.ndarray]
 
     def flipped(self) -> "Shape":
-        """The shape rotated by 180 degrees about x."""
+        """Returns the shape, rotated by 180 degrees about x."""
         flip = np.array([1.0, -1.0, -1.0])
         return Shape(self.solid.rotate((180, 0, 0)), [h * flip for h in self.hulls])
 
@@ -143,7 +143,7 @@ def ribbon(path: np.ndarray, widths: np.ndarray) -> np.ndarray:
 
 
 def blend(profile: CrossSection, inner_radius: float, outer_radius: float = 0.0) -> CrossSection:
-    """Rounds a profile's concave and convex corners to the given radii."""
+    """Rounds concave corners to `inner_radius`, and convex corners to `outer_radius`."""
     for radius in (inner_radius, -outer_radius):
         profile = profile.offset(radius, JoinType.Round, circular_segments=SEGMENTS)
         profile = profile.offset(-radius, JoinType.Round, circular_segments=SEGMENTS)
@@ -253,7 +253,7 @@ def _plate_hulls(
     coarse = profile.simplify(0.08)
     loops = coarse.to_polygons()
     points = np.vstack(loops)
-    # Leave out the upper bevel: nothing slides over it, and each vertex costs contact time.
+    # Leave out the upper bevel: nothing slides over it, and each vertex slows down the contact.
     levels = [(z_low, bevel), (z_low + bevel, 0.0), (z_high, 0.0)]
     insets = {
         inset: coarse.offset(-inset, JoinType.Miter, circular_segments=SEGMENTS)
@@ -272,7 +272,11 @@ def _plate_hulls(
 
 
 def loft(sections: Sequence[np.ndarray]) -> Shape:
-    """Makes a skin through cross-sections (n, 3) of equal n, each star-shaped about its mean."""
+    """Makes a solid whose surface passes through cross-sections (n, 3), all with the same n.
+
+    Each section must be star-shaped about its mean. There is one hull for each pair of neighbouring
+    sections.
+    """
     rings = np.asarray(sections, dtype=float)
     caps = tuple(manifold3d.triangulate([_planar(ring)]) for ring in (rings[0], rings[-1]))
     return Shape(_stitched(rings, caps), [np.vstack(pair) for pair in itertools.pairwise(rings)])

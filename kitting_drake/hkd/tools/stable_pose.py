@@ -46,8 +46,8 @@ def stable_poses(points: Array, center_of_mass: Array) -> list[StablePose]:
     """Returns the stable poses of a body, in a deterministic order.
 
     Args:
-        points: (n, 3) in the body's frame B; the body's convex hull is theirs.
-        center_of_mass: (3,) in B.
+        points: points (n, 3) in the body's frame B whose convex hull is that of the body.
+        center_of_mass: the centre of mass (3,) in B.
 
     Raises:
         scipy.spatial.QhullError: the hull of the points has no volume.
@@ -74,9 +74,9 @@ def stable_poses(points: Array, center_of_mass: Array) -> list[StablePose]:
 
 
 def _support_margin(support: Array, normal: Array, center_of_mass: Array) -> float:
-    """The distance of the centre of mass from the support's edge, seen along the normal.
+    """Returns the distance of the centre of mass from the support's edge, seen along the normal.
 
-    It is negative outside the support, and -1 if the support has no area.
+    The distance is negative outside the support, and -1 if the support has no area.
     """
     axes = np.linalg.svd(normal[None])[2][1:]
     try:

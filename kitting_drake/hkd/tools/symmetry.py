@@ -37,21 +37,23 @@ hollow part: it is equally far from the whole wall.
 """
 
 _REACH_MM = 0.75
-"""The largest distance in mm between the shift that best fits the surfaces and the one that best
-fits the outlines."""
+"""The largest distance in mm between the shift of the copy that best fits the surfaces and the
+shift that best fits the outlines."""
 
 Shift = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Difference:
-    """The difference between a tool and its rotated copy, each measure at the translation that
-    makes it least."""
+    """The difference between a tool and its rotated copy.
+
+    Each measure is taken at the translation of the copy that makes this measure least.
+    """
 
     outline_deviation_mm: float
     """The largest distance of a point of one outline from the other outline, at most 5 mm."""
     surface_distance_mm: float
-    """The symmetric mean distance of the surfaces, or infinity if the outlines differ too much.
+    """The symmetric mean distance of the surfaces in mm; infinity if the outlines differ too much.
 
     Unless the comparison is complete, a value above the limit is only a lower bound.
     """

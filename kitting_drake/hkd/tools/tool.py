@@ -98,18 +98,20 @@ class Tool:
 
     @property
     def axis(self) -> tuple[float, float] | None:
-        """The point (x, y) on the axis of symmetry in T, in metres; None: the middle of the
-        bounding box.
+        """The point (x, y) of the axis of symmetry in T, in metres.
 
-        If the order is odd, it is the footprint's centroid.
+        If the order of the symmetry is odd, this is the footprint's centroid. Otherwise it is None,
+        which stands for the middle of the bounding box.
         """
         if self.symmetry < 3 or self.symmetry % 2 == 0:
             return None
         return centroid(self.footprint)
 
     def surface_points(self, count: int, seed: int = 0) -> NDArray[np.float64]:
-        """Returns points (count, 3) spread over the surface by area, in T, in metres;
-        deterministic."""
+        """Returns random points (count, 3), uniform on the surface, in T, in metres.
+
+        Equal seeds give equal points.
+        """
         import trimesh
 
         faces = np.arange(3 * len(self.triangles)).reshape(-1, 3)
@@ -198,8 +200,13 @@ def load_tool(name: str, base: Path | None = None) -> Tool:
         mark = getattr(error, "problem_mark", None)
         where = f" from line {mark.line + 1} on" if mark else ""
         raise UserError(f"{record_path} is not a tool record: it is not YAML{where}") from error
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise UserError(f"{record_path} is not a tool record: {error!r}") from error
+    except KeyError as error:
+        raise UserError(f"{record_path} is not a tool record: it lacks {error}") from error
+    except (TypeError, ValueError, AttributeError) as error:
+        raise UserError(
+            f"{record_path} is not a tool record: a field is missing or has a wrong value: import "
+            "the tool again"
+        ) from error
     for path in (tool.sdf, *tool.visual_meshes):
         if not path.is_file():
             raise UserError(f"the tool '{name}' lacks its file {path}")
@@ -237,11 +244,7 @@ def _shared(tool: Tool, changed: tuple[int, ...]) -> Tool:
 
 
 def check_category(category: str) -> None:
-    """Checks that a name is valid for a category.
-
-    Raises:
-        UserError: it is not.
-    """
+    """Raises UserError if a name is not valid for a category."""
     if not re.fullmatch(r"[a-z][a-z0-9_]{0,31}", category):
         raise UserError(
             f"category '{category}' must consist of lower-case letters, digits and underscores, "
@@ -250,13 +253,15 @@ def check_category(category: str) -> None:
 
 
 def tool_names() -> list[str]:
-    """The names of the project's tools."""
+    """Returns the names of the project's tools."""
     return sorted(path.parent.name for path in (MODELS / "tools").glob("*/tool.yaml"))
 
 
 def user_tools() -> Path:
-    """The folder of the user's tools: `$KITTING_DRAKE_TOOLS`, or else a folder in
-    `~/.local/share`."""
+    """Returns the folder of the user's tools.
+
+    It is `$KITTING_DRAKE_TOOLS`, or else a folder in `~/.local/share`.
+    """
     given = os.environ.get("KITTING_DRAKE_TOOLS")
     return (
         Path(given).absolute()
@@ -266,7 +271,7 @@ def user_tools() -> Path:
 
 
 def user_tool_names() -> list[str]:
-    """The names of the tools in `user_tools`."""
+    """Returns the names of the tools in `user_tools`."""
     # Skip folders whose names begin with a dot, because they are unfinished.
     records = user_tools().glob("[!.]*/tool.yaml")
     return sorted(path.parent.name for path in records)

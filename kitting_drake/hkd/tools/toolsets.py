@@ -8,13 +8,15 @@ from kitting_drake.hkd.tools.tool import CATEGORIES, load_tool, tool_names
 PAPER_SPLITS = ("train", "test")
 """The splits of the paper's dataset (section IV-B.1): forty tools to train, twenty to test."""
 SPLITS = (*PAPER_SPLITS, "fresh")
-"""All splits. Append new ones, because the seeds depend on the order. The ten `fresh` tools are not
-in the paper's data set: they are reserved for a final test, and nothing is trained or tuned with
-them."""
+"""All splits. Append new splits at the end, because the seeds depend on the order.
+
+The ten `fresh` tools are not in the paper's data set. They are reserved for a final test, and
+nothing is trained or tuned with them.
+"""
 TOOLSET_COUNT = 100
 """The number of toolsets of a split, unless the split has fewer combinations."""
 TOOLSETS_SEED = 2024
-"""The seed of the random draw."""
+"""The seed of the random draw of toolsets."""
 
 
 def tool_pools(split: str) -> dict[str, list[str]]:
@@ -28,10 +30,10 @@ def tool_pools(split: str) -> dict[str, list[str]]:
 
 
 def toolsets(split: str) -> list[tuple[str, ...]]:
-    """Returns a split's toolsets, each in the order of `CATEGORIES`. They are distinct and
-    deterministic.
+    """Returns the toolsets of a split, each in the order of `CATEGORIES`.
 
-    There are `TOOLSET_COUNT` toolsets, or all combinations if these are fewer.
+    These are `TOOLSET_COUNT` different toolsets, or all combinations of tools if these are fewer.
+    The draw is deterministic.
 
     Raises:
         UserError: a category has no tool in the split.
