@@ -21,7 +21,9 @@ def describe_trace(tracer: argparse.ArgumentParser) -> None:
     tracer.add_argument(
         "photo", type=Path, metavar="PHOTO", help="a photo of the tools from above (JPEG, PNG)"
     )
-    tracer.add_argument("--output", type=Path, required=True, metavar="DIR", help="the folder")
+    tracer.add_argument(
+        "--output", type=Path, required=True, metavar="DIR", help="the folder to write"
+    )
     tracer.add_argument(
         "--sheet",
         nargs="+",

@@ -20,11 +20,11 @@ class Corrections:
     steps: tuple[tuple[str, NDArray[np.float64]], ...] = ()
     """Pairs of a verb, `add` or `remove`, and a polygon (n, 2) in mm on the picture's rulers."""
     corners: NDArray[np.float64] | None = None
-    """The sheet's corners (4, 2) in pixels of the photo, counter-clockwise in the picture; None:
-    found automatically."""
+    """The sheet's corners (4, 2) in pixels of the photo, counter-clockwise in the picture. None:
+    the corners are found automatically."""
 
     def settles(self, place: tuple[float, float]) -> bool:
-        """Whether a place (x, y), in mm, lies in a polygon, so the user has judged it."""
+        """Whether a place (x, y), in mm, lies in a polygon. The user has then checked it."""
         spot = CrossSection.square((0.1, 0.1), True).translate(place)
         return any(
             not (CrossSection([points], FillRule.EvenOdd) ^ spot).is_empty()
@@ -56,7 +56,7 @@ def read_corrections(path: Path) -> Corrections:
     steps, corners = [], None
     for number, item in enumerate(items, start=1):
         if not isinstance(item, dict) or len(item) != 1 or next(iter(item)) not in _KINDS:
-            raise UserError(f"{path}: item {number} must be one of {', '.join(_KINDS)}")
+            raise UserError(f"{path}: item {number} must have one of the keys {', '.join(_KINDS)}")
         ((kind, value),) = item.items()
         points = _points(value, f"{path}: item {number}")
         if kind != "sheet":

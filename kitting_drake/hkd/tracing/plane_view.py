@@ -52,7 +52,7 @@ def view_of(homography: Array, focal_px: float, center: Array) -> PlaneView:
     """Returns the view of a plane, with the camera's pose computed from a homography.
 
     Args:
-        homography: (3, 3) from the plane in mm to pixels.
+        homography: the homography (3, 3) from the plane in mm to pixels.
         focal_px: the focal length in pixels.
         center: (2,) the principal point in pixels.
     """
@@ -82,7 +82,7 @@ def focal_of_homography(homography: Array, center: Array) -> float | None:
     It is the focal length at which the plane's axes are perpendicular and equally scaled.
 
     Args:
-        homography: (3, 3) from the plane in mm to pixels.
+        homography: the homography (3, 3) from the plane in mm to pixels.
         center: (2,) the principal point in pixels.
 
     Returns:
@@ -107,7 +107,7 @@ def focal_of_height(homography: Array, height: float, start_px: float, center: A
     """Finds the focal length in pixels that puts the camera at a given height above the plane.
 
     Args:
-        homography: (3, 3) from the plane in mm to pixels.
+        homography: the homography (3, 3) from the plane in mm to pixels.
         height: the camera's height in mm.
         start_px: the focal length at which the search starts.
         center: (2,) the principal point in pixels.
@@ -184,7 +184,7 @@ class RectifiedPhoto:
 def rectify(
     cv2: Any, pixels: Any, view: PlaneView, low: Array, high: Array, px_per_mm: float
 ) -> RectifiedPhoto:
-    """Shows the part of the plane from `low` to `high` as from straight above.
+    """Returns the part of the plane from `low` to `high`, as seen from straight above.
 
     Args:
         cv2: OpenCV.
@@ -212,6 +212,6 @@ def rectify(
     image = cv2.warpPerspective(pixels, H, (columns, rows), flags=flags)
     inside = np.full(pixels.shape[:2], 255, np.uint8)
     seen = cv2.warpPerspective(inside, H, (columns, rows), flags=cv2.WARP_INVERSE_MAP)
-    # The photo's outermost pixels are interpolated with the empty area beyond them.
+    # Leave out the photo's outermost pixels, which are interpolated with the empty area beyond.
     seen = cv2.erode(seen, np.ones((7, 7), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
     return RectifiedPhoto(image, seen > 250, px_per_mm, np.asarray(low, float))

@@ -29,13 +29,12 @@ _SMALL_SIDE = 1200
 
 @dataclass(frozen=True)
 class Scale:
-    """An object of known size in the photo: exactly one of `points`, `disc_mm` and `board` is
-    set."""
+    """An object of known size in the photo: `points`, `disc_mm` or `board`; the others are None."""
 
     points: tuple[float, float, float, float] | None = None
     """Two points u1, v1, u2, v2 of the photo, in pixels, for instance on a ruler."""
     length_mm: float = 0.0
-    """The distance between the two points."""
+    """The distance between the two points, in mm."""
     disc_mm: float | None = None
     """The diameter of a disc or coin."""
     board: tuple[int, int, float, float] | None = None
@@ -76,7 +75,8 @@ def plane_of_scale(cv2: Any, photo: Photo, scale: Scale, camera_mm: float | None
     distance = math.hypot(u2 - u1, v2 - v1)
     if distance < 20 or not 1 <= scale.length_mm <= 5000:
         raise UserError(
-            "--scale_px must be two points at least 20 pixels apart, and --scale_mm their distance"
+            "--scale_px must be two points at least 20 pixels apart, and --scale_mm must be their "
+            "distance, 1 to 5000 mm"
         )
     px_per_mm = distance / scale.length_mm
     focal, told = _focal(photo, px_per_mm, camera_mm)
@@ -191,7 +191,8 @@ def _by_board(cv2: Any, photo: Photo, scale: Scale, camera_mm: float | None) -> 
         )
     except (cv2.error, SystemError) as error:
         raise UserError(
-            f"--board: OpenCV cannot make a board of {columns} x {rows} squares with these sizes"
+            f"--board: OpenCV cannot make a board of {columns} x {rows} squares of {square:g} mm "
+            f"with markers of {marker:g} mm: check these numbers"
         ) from error
     gray = cv2.cvtColor(photo.pixels, cv2.COLOR_RGB2GRAY)
     corners, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(gray)

@@ -16,9 +16,11 @@ _SAMPLES = 400
 _LEAST_SUPPORT = 0.4
 """The least share of each edge that must be visible."""
 _REACHES = ((0.012, 0.005), (0.05, 0.012, 0.005))
-"""How far from a rough edge to search for the true one, as shares of the photo's longer side. Each
-row is one attempt, refined from left to right; the far search of the second row is for an edge that
-a tool hides."""
+"""The distances from a rough edge within which the true edge is sought.
+
+They are shares of the photo's longer side. Each row is one attempt, in which its distances are used
+one after the other. The second row begins with a larger distance, for an edge that a tool hides.
+"""
 _CLOSE_PX = 2.5
 _SAME_QUAD = 0.02
 
@@ -112,7 +114,7 @@ def _four_sides(cv2: Any, hull: Any) -> Array | None:
     if len(polygon) < 4:
         return None
     sides = np.roll(polygon, -1, axis=0) - polygon
-    # Merge successive sides that have nearly the same direction.
+    # Keep the four longest sides, in their order around the hull.
     longest = sorted(np.argsort(-np.linalg.norm(sides, axis=1))[:4].tolist())
     lines = [_line(polygon[i], polygon[i] + sides[i]) for i in longest]
     corners = [_crossing(lines[i - 1], lines[i]) for i in range(4)]
@@ -191,7 +193,7 @@ def _edge(
         cv2: OpenCV.
         gray: (rows, columns) the lightness.
         start: (2,) the start of the segment in pixels.
-        end: (2,) its end.
+        end: (2,) the end of the segment in pixels.
         reach: how far from the segment to search, in pixels.
         sign: 1 or -1, the direction across the segment in which the lightness rises.
 
@@ -231,7 +233,11 @@ def _edge(
 
 
 def _robust_line(shares: Array, offsets: Array) -> tuple[Array, Array]:
-    """Fits a line to most of the points; returns its (offset, slope) and a mask of these points."""
+    """Fits a line to most of the points, and ignores outliers.
+
+    Returns:
+        The (offset, slope) of the line, and a mask (n) of the points that are close to it.
+    """
     rng = np.random.default_rng(0)
     design = np.c_[np.ones_like(shares), shares]
     first, second = rng.integers(0, len(shares), (2, 200))

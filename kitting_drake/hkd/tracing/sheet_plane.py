@@ -22,12 +22,12 @@ from kitting_drake.hkd.tracing.sheet_finder import SheetQuad, find_quads
 Array = NDArray[np.float64]
 
 SHEETS = {"a4": (297.0, 210.0), "letter": (279.4, 215.9)}
-"""Sizes of sheets, the longer side first, in mm."""
+"""The sides of sheets of paper in mm, the longer side first."""
 _ASPECT_ERROR = 0.025
 """The largest error of the ratio of a sheet's sides at which its format is recognised."""
 _GIVEN_ASPECT_ERROR = 0.06
 _FOCALS_35MM = (22.0, 24.0, 26.0, 28.0, 31.0)
-"""Typical 35 mm equivalent focal lengths of phones, for photos without EXIF data on it."""
+"""Typical 35 mm equivalent focal lengths of phones, for photos that do not state theirs."""
 _FOCAL_RANGE_35MM = (18.0, 90.0)
 _MARGIN_MM = 8.0
 _BOW_MM = 0.3
@@ -42,13 +42,13 @@ class GroundPlane:
     pixels: Any
     """The photo's pixels (rows, columns, 3), without the lens distortion."""
     low: Array
-    """The lower left corner (2,) of the part of the plane to trace, in mm; `high` is its upper
-    right corner."""
+    """The lower left corner (2,) of the part of the plane to trace, in mm."""
     high: Array
+    """The upper right corner (2,) of the part of the plane to trace, in mm."""
     sheet: Array | None
     """The sides (2,) of the sheet in mm, if there is one; its lower left corner is the origin."""
     hidden: tuple[Array, ...]
-    """Polygons (n, 2) in mm in which no tools are searched."""
+    """Polygons (n, 2) in mm in which no tools are sought."""
     notes: list[str]
     blur_mm: float = 0.0
     """The width of the blur of the sheet's edges in mm; 0 if unknown."""
@@ -66,8 +66,8 @@ def plane_of_sheet(
     Args:
         cv2: OpenCV.
         photo: the photo.
-        size: the sheet's sides, in mm; None: A4 or Letter, by the ratio of the sides seen.
-        corners: (4, 2) the sheet's corners in pixels; None: they are searched.
+        size: the sheet's sides, in mm; None: A4 or Letter, by the ratio of its sides in the photo.
+        corners: (4, 2) the sheet's corners in pixels; None: they are found automatically.
         camera_mm: the camera's height above the sheet, in mm; None: computed from the focal length.
 
     Raises:
@@ -119,8 +119,7 @@ def _oriented(photo: Photo, corners: Array, size: tuple[float, float]) -> tuple[
 def _choose(
     photo: Photo, quads: list[SheetQuad], size: tuple[float, float] | None
 ) -> tuple[SheetQuad, tuple[float, float]]:
-    """Chooses the largest quadrilateral with the proportions of a sheet; returns it and the
-    size."""
+    """Returns the largest quadrilateral with the proportions of a sheet, and the sheet's size."""
     if not quads:
         raise UserError(
             f"{photo.path}: no sheet of paper is found: lay the tools on a whole A4 or Letter "
@@ -143,14 +142,16 @@ def _choose(
     ratio = max(ratio, 1 / ratio)
     wanted = "A4 (1.414) or Letter (1.294)" if size is None else f"{max(size) / min(size):.3f}"
     raise UserError(
-        f"{photo.path}: the sides of the largest sheet found are as {ratio:.3f} to 1, not "
+        f"{photo.path}: the ratio of the sides of the largest sheet found is {ratio:.3f}, not "
         f"{wanted}: show the whole sheet, flat, or give its size with --sheet LENGTH WIDTH"
     )
 
 
 def _aspect_error(photo: Photo, corners: Array, size: tuple[float, float]) -> float:
-    """The smallest error of the logarithm of the ratio of a sheet's sides, over the possible focal
-    lengths."""
+    """Returns the error of the logarithm of the ratio of a sheet's sides.
+
+    If the focal length is not known, this is the smallest error at any of `_FOCALS_35MM`.
+    """
     focals = (photo.focal_35mm,) if photo.focal_35mm else _FOCALS_35MM
     wanted = math.log(max(size) / min(size))
     errors = []
@@ -199,7 +200,7 @@ def _lens_of_edges(
     )
 
     def bows(k1: float) -> Array:
-        """The rise of each edge over its chord, in mm, after correction with k1."""
+        """Returns the rise (4,) of each edge over its chord, in mm, after correction with k1."""
         result = []
         for points in quad.edges:
             p = (points - photo.center) / focal

@@ -22,7 +22,7 @@ _LEAST_LOOP_MM2 = 4.0
 _LEAST_TOOL_MM2 = 60.0
 _FLAT_MM = 0.03
 _EDGE_SLACK_MM = 0.4
-"""Half the width in mm of a strip that is ignored where two looks differ."""
+"""Half the width, in mm, of the strips between two masks that are ignored."""
 
 
 @dataclass(frozen=True)
@@ -30,9 +30,9 @@ class Unclear:
     """A region that may be tool, or may be ground or shadow."""
 
     place: tuple[float, float]
-    """Its centroid (x, y), in mm."""
+    """The centroid (x, y) of the region, in mm."""
     area: float
-    """Its area, in mm^2."""
+    """The area of the region, in mm^2."""
 
 
 def find_silhouettes(
@@ -49,7 +49,7 @@ def find_silhouettes(
         photo: the plane as seen from straight above.
         sheet: (2,) the sides of the sheet on which the tools lie, in mm; its lower left corner is
             the origin. None: there is no sheet, and tools may lie anywhere in the photo.
-        hidden: polygons (n, 2) in mm in which no tools are searched.
+        hidden: polygons (n, 2) in mm in which no tools are sought.
         height: the height of the lowest tool, in mm; None: unknown.
 
     Returns:
@@ -126,7 +126,7 @@ def _cleaned(area: CrossSection) -> CrossSection:
 
 
 def _blur_mm(cv2: Any, soft: Array, mask: Array, ppm: float) -> float:
-    """The median width over which the silhouettes' border rises from 0 to 1."""
+    """Returns the median width in mm over which a soft mask rises from 0 to 1 at its border."""
     x = cv2.Sobel(soft, cv2.CV_32F, 1, 0, scale=ppm / 8)
     y = cv2.Sobel(soft, cv2.CV_32F, 0, 1, scale=ppm / 8)
     slope = np.hypot(x, y)[(soft > 0.35) & (soft < 0.65)]
@@ -141,10 +141,10 @@ _LEAST_CONTRAST = 0.03
 
 
 def soft_mask(cv2: Any, photo: RectifiedPhoto, mask: Array) -> Array:
-    """Estimates how much of each pixel near the edge of a mask a tool covers.
+    """Estimates the share of each pixel that tools cover, near the edge of their mask.
 
-    The colours of the tool and of the ground are taken a little inside and outside of the edge, so
-    a shadow beside a tool counts as ground.
+    The colour of the tool is taken a little inside the edge, and that of the ground a little
+    outside it. A shadow beside a tool therefore counts as ground.
 
     Returns:
         The covered share (rows, columns), from 0 to 1.
@@ -162,7 +162,7 @@ def soft_mask(cv2: Any, photo: RectifiedPhoto, mask: Array) -> Array:
 
 
 def _soft(cv2: Any, light: Array, mask: Array, ppm: float) -> Array:
-    # The blur is at least one or two pixels wide.
+    # Skip at least 1.5 pixels on both sides of the edge, because the photo is blurred there.
     skip = max(_SKIP_MM, 1.5 / ppm)
     inside = cv2.distanceTransform(mask, cv2.DIST_L2, 5) / ppm
     outside = cv2.distanceTransform(1 - mask, cv2.DIST_L2, 5) / ppm
@@ -184,10 +184,10 @@ def _soft(cv2: Any, light: Array, mask: Array, ppm: float) -> Array:
 
 
 def _spread_colour(cv2: Any, light: Array, where: Array, ppm: float) -> Array:
-    """Averages the colour of the nearby pixels that are in a mask.
+    """Averages the colours of the pixels in a mask around each pixel.
 
     Returns:
-        The mean colour and the weight of each pixel (rows, columns, 4).
+        The mean colour, and the share of nearby pixels that are in the mask, (rows, columns, 4).
     """
     stacked = np.empty((*where.shape, 4), np.float32)
     stacked[..., :3] = light
@@ -203,7 +203,6 @@ def _spread_colour(cv2: Any, light: Array, where: Array, ppm: float) -> Array:
 
 def contours(photo: RectifiedPhoto, soft: Array) -> CrossSection:
     """Returns the area in mm in which a soft mask (rows, columns) exceeds one half."""
-    # Import matplotlib lazily.
     import contourpy
 
     padded = np.pad(soft, 1)

@@ -18,11 +18,11 @@ def outline_of_silhouette(
     """Computes a tool's outline from its silhouette, both in mm in the plane's frame.
 
     Let the camera be at height H above the plane, and the tool t high. A point at height h appears
-    H / (H - h) times as far from the point below the camera. Of an upright side, the camera sees
-    the top where the side faces away from the point below the camera, and the foot where it faces
-    that point. So the outline is the part of the plane that the silhouette covers at every scale
-    from 1 to H / (H - t). The widest points of a round tool are at height t / 2 on all sides, so
-    its silhouette is scaled once.
+    H / (H - h) times as far from the point below the camera. Where an upright side faces away from
+    that point, the camera sees its top. Where it faces that point, the camera sees its foot. So the
+    outline is the part of the plane that the silhouette covers at every scale from 1 to
+    (H - t) / H. The widest points of a round tool are at height t / 2 on all sides, so its
+    silhouette is scaled only once.
 
     Args:
         silhouette: the area that the tool hides in the plane.

@@ -15,7 +15,7 @@ brighter, or differently coloured."""
 _NO_SHADOW = 1.3
 """The largest darkening by a shadow, in logarithms of light."""
 _BALL_MM = 0.9
-"""The radius of the disc that must fit wherever the ground is found, in mm."""
+"""The radius of the disc that `_reached` rolls over the ground, in mm."""
 _ROUGH = 0.022
 """The least roughness of a tool's surface, in logarithms of light."""
 _MOST_FINE = 0.1
@@ -26,12 +26,11 @@ _SHINE_STEEP = 0.6
 """The largest slope of the edge of a specular reflection, in logarithms of light per mm."""
 _STEP_REACH_MM = 1.5
 _SHINY, _SHINY_SHARE = 0.06, 0.25
-"""A bay is shine if more than this share of it is this much brighter than the ground, in logarithms
-of light."""
+"""A bay or hole of a tool's mask is a reflection if more than `_SHINY_SHARE` of it is brighter than
+the ground by more than `_SHINY`, in logarithms of light."""
 _SHINE_REACH_MM = 3.0
 _BAY_MM = 12.0
-"""Half the width, in mm, below which a bright band with soft edges across a tool is a
-reflection."""
+"""Half the largest width, in mm, of the bays and holes that may be reflections."""
 _NEUTRAL = 0.05
 _LARGEST_HOLE_MM2 = 500.0
 """The area in mm^2 above which a hole must show ground that is not in shadow."""
@@ -46,19 +45,21 @@ class ShadowLook:
     """The limits by which shadows are told from tools."""
 
     steep: float
-    """A steeper step of the logarithm of light, per mm, is not the edge of a shadow."""
+    """The largest slope of the logarithm of light, per mm, at the edge of a shadow."""
     rough: float
-    """A shadow is rougher than the plain ground by at most this factor."""
+    """The largest ratio of a shadow's roughness to that of the plain ground."""
     shine: float
-    """A bay or hole is shine if the step of light is wider than this, in mm, on 30 % of its
-    border."""
+    """A bay or hole is a reflection if the step of light is wider than this, in mm, on 30 % of its
+    border with the tool."""
 
 
 CAREFUL = ShadowLook(0.3, 2.0, 1.2)
-"""Takes faint edges for edges of tools. The shadows of low tools have sharper edges."""
+"""The look for high tools, whose shadows have soft edges: faint edges belong to tools."""
 MIDDLE = ShadowLook(0.45, 3.0, 1.2)
+"""The look for low tools and for tools of unknown height."""
 BOLD = ShadowLook(0.65, 4.0, math.inf)
-"""Follows shadows over faint edges. Where it differs from another look, the outline is in doubt."""
+"""A look for a second opinion: faint edges belong to shadows. Where its mask differs from that of
+another look, the outline is in doubt."""
 _LOW_MM = 9.0
 _COARSE_PX_PER_MM = 3.5
 _FINE_PX_PER_MM = 5.0
@@ -66,9 +67,13 @@ _FINE_PX_PER_MM = 5.0
 
 
 def look_for(height: float | None, px_per_mm: float) -> ShadowLook:
-    """Returns the look that suits tools of a height in mm, or of an unknown one (None).
+    """Returns the look that suits the height of the tools and the resolution of the photo.
 
-    In a coarse photo a shadow's edge beside a tool is as rough as a tool.
+    `CAREFUL` does not suit a coarse photo, in which a shadow's edge is as rough as a tool.
+
+    Args:
+        height: the tools' height in mm; None: unknown.
+        px_per_mm: the resolution.
     """
     if height is None or height < _LOW_MM or px_per_mm < _COARSE_PX_PER_MM:
         return MIDDLE
@@ -76,7 +81,7 @@ def look_for(height: float | None, px_per_mm: float) -> ShadowLook:
 
 
 class ToolMasks:
-    """Separates the tools in one photo from the ground, by one look or another."""
+    """Separates the tools in one photo from the ground, with the limits of any look."""
 
     def __init__(
         self, cv2: Any, ratio: Array, ground: Array, spread: float, px_per_mm: float
@@ -114,9 +119,9 @@ class ToolMasks:
     def mask(self, look: ShadowLook) -> Array:
         """Returns a mask (rows, columns): 1 where a tool hides the ground.
 
-        Pixels that look like the ground are ground. So are shadows: neutral pixels that are
-        reached from there over soft steps. The rest is a tool. A watershed puts its border at the
-        steepest step between the two.
+        Pixels that look like the ground are ground. Shadows count as ground, too: these are pixels
+        without colour that no steep step of light separates from the ground. All other pixels are
+        tools. A watershed moves the border of the tools to the steepest step of light nearby.
         """
         cv2, ground, px_per_mm, noise = self._cv2, self._ground, self._px_per_mm, self._noise
         free = (self._steep < look.steep * noise) & (self._colour < _COLOURED * noise)
@@ -125,7 +130,7 @@ class ToolMasks:
         roughest = max(_ROUGH * look.rough / 3, look.rough * self._usual)
         even = (free & (self._rough < roughest)) | ~ground
         reached = _reached(cv2, even, self._plain, px_per_mm)
-        # A hole may lie wholly in shadow, so its edges are close.
+        # A hole may lie wholly in shadow. Its edges are close, so use the fine roughness.
         usual = _median(self._fine[self._plain & ground], _ROUGH)
         limit = 1.7 * usual * np.exp(-self._lightness / 2)
         like_ground = (self._colour < _NEUTRAL * noise) & (self._fine < limit)
@@ -141,16 +146,20 @@ class ToolMasks:
         return self._bordered(self._without_shine(tool, widest))
 
     def shine(self, mask: Array) -> Array:
-        """Returns a mask (rows, columns): 1 beside a given one where no ground is as bright."""
+        """Returns a mask (rows, columns): 1 beside the given mask where ground is not so bright.
+
+        Such pixels are probably reflections on a tool.
+        """
         cv2 = self._cv2
         near = cv2.dilate(mask, _disc(cv2, _SHINE_REACH_MM * self._px_per_mm))
         bright = (self._lightness > 2 * _SHINY * self._noise) & self._ground
         return ((near > mask) & bright).astype(np.uint8)
 
     def _without_shine(self, tool: Array, widest: float) -> Array:
-        """Fills bays and holes where the tool shines.
+        """Fills the bays and holes of a mask that are reflections on a tool.
 
-        Their border with the tool is soft, or they are brighter than the ground.
+        Their border with the tool is soft, or they are brighter than the ground. `widest` is the
+        largest width in mm of a step of light that is not soft.
         """
         cv2, px_per_mm = self._cv2, self._px_per_mm
         closed = _closed(cv2, tool, _BAY_MM * px_per_mm, px_per_mm)
@@ -168,7 +177,7 @@ class ToolMasks:
             if not border.any():
                 continue
             soft = np.median(self._peak[box][border]) < _SHINE_STEEP
-            # One side of shine may be a sharp edge.
+            # A reflection may have a sharp edge on one side.
             soft |= np.percentile(self._width[box][border], 70) > widest
             if soft or (self._lightness[box][bay] > _SHINY).mean() > _SHINY_SHARE:
                 filled[box][bay] = 1
@@ -184,8 +193,8 @@ class ToolMasks:
         image = ((np.clip(-self._smooth, -0.3, 2.25) + 0.3) * 100).astype(np.uint8)
         cv2.watershed(np.ascontiguousarray(image), markers)
         mask = (markers == 2).astype(np.uint8)
-        # The watershed's lines belong to neither side; assign each to the side with more of its
-        # neighbours.
+        # The watershed's lines belong to neither side. Assign each of their pixels to the side with
+        # more of its neighbours.
         mask[(markers == -1) & (cv2.blur(mask.astype(np.float32), (3, 3)) > 0.4)] = 1
         return _cleaned(cv2, mask, self._evidence, px_per_mm)
 
@@ -204,7 +213,7 @@ def _lightness_and_colour(cv2: Any, logs: Array) -> tuple[Array, Array]:
 
 
 def _steepness(cv2: Any, smooth: Array, px_per_mm: float) -> Array:
-    """Returns the largest slope (rows, columns) of any colour, per mm."""
+    """Returns the largest slope (rows, columns) of the three colour channels, per mm."""
     steep = np.zeros(smooth.shape[:2], np.float32)
     for k in range(3):
         x = cv2.Sobel(smooth[..., k], cv2.CV_32F, 1, 0, scale=px_per_mm / 8)
@@ -256,7 +265,7 @@ def _shaded_holes(cv2: Any, even: Array, like_ground: Array, px_per_mm: float) -
 
 
 def _closed(cv2: Any, mask: Array, radius: float, px_per_mm: float) -> Array:
-    """Closes a mask by a large disc, at a coarser resolution, which is faster."""
+    """Closes a mask morphologically with a large disc. The resolution is reduced to save time."""
     rows, columns = mask.shape
     factor = max(1, int(px_per_mm / 1.5))
     margin = math.ceil(radius / factor) + 2
@@ -284,7 +293,7 @@ def _components(cv2: Any, mask: Array, evidence: Array, px_per_mm: float) -> Arr
 
 
 def _cleaned(cv2: Any, mask: Array, evidence: Array, px_per_mm: float) -> Array:
-    """Removes specks, and fills the holes that do not show the ground."""
+    """Removes specks, and fills holes that are small or narrow."""
     mask = _components(cv2, mask, evidence, px_per_mm)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(1 - mask, connectivity=4)
     for i in range(1, count):

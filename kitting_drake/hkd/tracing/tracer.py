@@ -167,8 +167,7 @@ def _check_view(photo: Photo, plane: GroundPlane) -> None:
 def _look(
     cv2: Any, photo: Photo, plane: GroundPlane, heights: tuple[float, ...]
 ) -> tuple[RectifiedPhoto, CrossSection, float, list[Unclear]]:
-    """Returns the photo as seen from above, the tools' silhouettes, the width of their blur in mm,
-    and what is not clear."""
+    """Returns the photo as seen from above, and what `find_silhouettes` finds in it."""
     seen = _rectified(cv2, plane)
     try:
         return (
@@ -219,8 +218,11 @@ def _check_parts(
 def _doubts(
     parts: list[CrossSection], unclear: list[Unclear], corrections: Corrections
 ) -> list[tuple[Unclear, ...]]:
-    """Returns, for each silhouette, the places where it may be wrong: gaps to close neighbours,
-    and then what is not clear, the largest first. Corrected places do not count."""
+    """Returns, for each silhouette, the places where it may be wrong.
+
+    These are gaps to close neighbours, and then unclear regions, the largest first. Places that the
+    user has corrected are left out.
+    """
     near: list[list[Unclear]] = [[] for _ in parts]
     for item in unclear:
         if corrections.settles(item.place):
@@ -241,8 +243,10 @@ def _doubts(
 
 
 def _gap_between(part: CrossSection, other: CrossSection) -> Unclear | None:
-    """Returns the gap between two silhouettes that are so close that shine may have split one
-    tool; None if they are not."""
+    """Returns the gap between two silhouettes that may belong to one tool, split by a reflection.
+
+    Returns None if they are too far apart.
+    """
     grown = _APART_MM / 2
     bridge = part.offset(grown, JoinType.Round) ^ other.offset(grown, JoinType.Round)
     if bridge.is_empty():
@@ -279,7 +283,7 @@ def _corrected(
     if height > _SHARE_OF_HEIGHT * camera[2]:
         raise UserError(
             f"{photo.path}: the camera is only {camera[2]:.0f} mm above the ground, which is too "
-            f"close for a tool {height:g} mm high"
+            f"close for a tool {height:g} mm high: take the photo from farther away"
         )
     outline = outline_of_silhouette(part, camera, height, edges)
     parts = sorted(outline.decompose(), key=lambda piece: -piece.area())

@@ -144,7 +144,7 @@ def test_points_correct_the_outline(tmp_path: Path):
     assert tool.holes == 0
     assert tool.size_mm[0] < 125
     points.write_text("- widen: [[1, 2]]\n")
-    with pytest.raises(UserError, match="item 1 must be one of add, remove, sheet"):
+    with pytest.raises(UserError, match="item 1 must have one of the keys add, remove, sheet"):
         traced(path, points=points)
 
 
