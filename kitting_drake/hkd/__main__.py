@@ -35,7 +35,7 @@ def list_tools(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
 
 def generate(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
     """Regenerates models and prints how closely their collision hulls match the visual shape."""
-    table = Table(caption="outline, top, grip: largest distance of the collision hulls, in mm")
+    table = Table(caption="outline, top, grip: largest error of the collision hulls, in mm")
     table.add_column("name", no_wrap=True)
     for heading in ("triangles", "hulls", "outline", "top", "grip", "tilt, deg"):
         table.add_column(heading, justify="right")
@@ -71,7 +71,7 @@ def sheet(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
 
 
 def build(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
-    """Writes the paper's tools and kits to a folder that other simulators can load."""
+    """Writes the paper's tools and kits to a folder, in formats that other simulators load."""
     from kitting_drake.hkd.dataset import build_dataset
 
     with Progress(console=Console(stderr=True), transient=True, disable=args.quiet) as progress:
@@ -87,7 +87,7 @@ def build(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
 
 
 def annotate(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
-    """Opens a page that shows a tool, moves a gripper over it and saves its grasp."""
+    """Opens a page on which you move a gripper over a tool and save a grasp."""
     from kitting_drake.hkd.annotate import annotate as annotate_tool
 
     annotate_tool(args.name, Console())
@@ -134,7 +134,7 @@ def kit(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
 
     request = request_of(args, "" if args.robot is None else _robot_text(args.robot))
     if args.prove:
-        # Import Drake lazily, and early enough that a missing Drake is reported before any work.
+        # Check early, so that missing libraries are reported before any work.
         from kitting_drake.common.rendering import require_rendering
 
         require_rendering()
@@ -174,7 +174,7 @@ _SCENES = 20
 
 
 def _robot_text(path: Path) -> str:
-    """Reads the arm of a robot file and returns it as lines of a scenario.
+    """Reads the arm of a robot file and returns the YAML lines that set it in a scenario.
 
     Raises:
         UserError: the file is invalid, or the arm stands in the workspace.
@@ -194,9 +194,12 @@ def _robot_text(path: Path) -> str:
 
 
 def _check_scenario(path: Path, console: Console) -> bool:
-    """Prints how to run a kit's scenario, or why it cannot be run; returns whether it can.
+    """Prints how to run a kit's scenario, or why it cannot be run.
 
-    For an arm, it also prints in how many scenes the arm reaches everything.
+    If the robot is an arm, also prints in how many scenes the arm reaches everything.
+
+    Returns:
+        Whether the scenario can be run.
     """
     # Import the loader lazily, because it is slow to import.
     from kitting_drake.scenario.loader import load_scenario
@@ -225,7 +228,7 @@ def _check_scenario(path: Path, console: Console) -> bool:
 
 
 def _reach_note(scenario: Scenario, base: Path) -> str:
-    """Says in how many scenes an arm reaches all cavities and tools of a kit.
+    """Returns a sentence on the number of scenes in which an arm reaches all of a kit.
 
     Raises:
         UserError: the arm cannot reach its home.
@@ -245,7 +248,7 @@ def _reach_note(scenario: Scenario, base: Path) -> str:
         reached += not problems
         first = first or (problems[0] if problems else "")
     found = f"the arm reaches all cavities and tools in {reached} of {_SCENES} scenes"
-    return f"{found}; in one of the others, {first}" if first else found
+    return f"{found}; in one of the other scenes, {first}" if first else found
 
 
 def main() -> int:

@@ -62,10 +62,10 @@ def measure_grasp(tool: Tool, x: float, y: float, theta: float) -> Grasp | None:
 
 
 def save_grasp(tool: Tool, grasp: Grasp, models: Path = MODELS) -> None:
-    """Saves a grasp as the tool's annotated one.
+    """Saves a grasp as the annotated grasp of a tool.
 
-    A tool of the catalogue is changed in the catalogue and generated again. For any other tool, the
-    grasp is written to its record.
+    If the tool is in the catalogue, the catalogue is changed and the tool is generated again.
+    Otherwise, the grasp is written to the tool's record, `tool.yaml`.
 
     Args:
         tool: the tool.
@@ -85,7 +85,7 @@ def save_grasp(tool: Tool, grasp: Grasp, models: Path = MODELS) -> None:
         record_path = tool.directory / "tool.yaml"
         record = yaml.safe_load(record_path.read_text())
         record["grasp"] = {key: round(value, 6) for key, value in dataclasses.asdict(grasp).items()}
-        # Drop the other grasps, because they were chosen to complement another first grasp.
+        # Drop the other grasps: they were chosen to complement the previous annotated grasp.
         record.pop("other_grasps", None)
         # Mark the grasp, so that a repeated import keeps it.
         record["annotated"] = True
@@ -103,7 +103,7 @@ def save_grasp(tool: Tool, grasp: Grasp, models: Path = MODELS) -> None:
 
 
 def with_grasp(catalogue: str, name: str, grasp: Grasp) -> str:
-    """Replaces one tool's grasp in the catalogue's text; keeps everything else, including comments.
+    """Returns the catalogue's text with a new grasp for one tool, and all else unchanged.
 
     Raises:
         UserError: the catalogue has no such tool.
@@ -124,8 +124,8 @@ def with_grasp(catalogue: str, name: str, grasp: Grasp) -> str:
 class AnnotationPage:
     """The page with the tool, the hand above it, sliders and buttons.
 
-    The sliders move the hand. The button "take proposal" moves it to the proposal that the first
-    slider selects.
+    The sliders move the hand. The slider "proposal" selects a proposed grasp, and the button "take
+    proposal" moves the hand to it.
     """
 
     def __init__(self, tool: Tool, proposals: list[GraspProposal], meshcat: Meshcat) -> None:
@@ -167,7 +167,10 @@ class AnnotationPage:
         return int(self._meshcat.GetButtonClicks(button))
 
     def refresh(self) -> None:
-        """Takes a proposal if the button was clicked, and draws the hand at the sliders' pose."""
+        """Draws the hand at the sliders' pose.
+
+        If "take proposal" was clicked, first sets the sliders to the selected proposal.
+        """
         if self._proposals and self.clicks("take proposal") != self._taken:
             self._taken = self.clicks("take proposal")
             chosen = self._proposals[round(self._meshcat.GetSliderValue("proposal")) - 1]

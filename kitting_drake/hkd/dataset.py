@@ -125,7 +125,7 @@ def _kit_entry(name: str, split: str, kit: Kit, root: Path) -> dict[str, Any]:
 
 
 def _models(sdf: Path, root: Path) -> dict[str, str]:
-    """Returns the paths of a model, relative to `root`, by format."""
+    """Returns the path of a model in each format that was written, relative to `root`."""
     paths = {"sdf": sdf, "mjcf": sdf.with_suffix(".xml")}
     return {key: path.relative_to(root).as_posix() for key, path in paths.items() if path.exists()}
 

@@ -1,8 +1,8 @@
 """MuJoCo models (MJCF) of tools and kits, converted from their SDFormat models.
 
 MuJoCo replaces every collision mesh by its convex hull. A tool's collision meshes are convex
-already. A kit's block is cut into upright convex prisms. They are exact except for the bevel around
-the rims, which becomes one step of half its width and its whole depth.
+already. A kit's block is cut into upright convex prisms. They are exact except around the rims,
+where the bevel is replaced by a step of half the bevel's width and all of its depth.
 """
 
 from __future__ import annotations
@@ -109,8 +109,8 @@ def block_prisms(
     """Splits a block with upright walls into upright convex prisms, which may overlap.
 
     Args:
-        vertices: (n, 3) in m.
-        faces: (m, 3) of a watertight mesh.
+        vertices: the vertices (n, 3) of a watertight mesh, in m.
+        faces: the triangles (m, 3) of the mesh.
 
     Returns:
         The corners (k, 3) of each prism, in m.

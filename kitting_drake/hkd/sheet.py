@@ -54,8 +54,10 @@ _LIGHTS = [
 def camera_pose(
     target: np.ndarray, azimuth_deg: float, elevation_deg: float, distance: float
 ) -> RigidTransform:
-    """Returns X_WC of a camera that looks at `target` (m) from the given side: +z forward, y
-    down."""
+    """Returns the pose X_WC of a camera that looks at `target` from a given side.
+
+    The camera's z axis points forward, and its y axis points down. Lengths are in metres.
+    """
     a, e = np.radians([azimuth_deg, elevation_deg])
     toward = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
     # The camera's right is horizontal, and is defined even when the camera looks straight down.
@@ -79,7 +81,7 @@ class Subject:
 
 
 def tool_subject(tool: Tool) -> Subject:
-    """A tool at rest on the table."""
+    """Returns the content of a picture of a tool at rest on the table."""
     title = tool.name.replace("_", " ")
     # View tools that are larger than the dataset's from farther away.
     size = 0.208 * max(1.0, tool.length / 0.2, tool.width / 0.13)
@@ -87,7 +89,10 @@ def tool_subject(tool: Tool) -> Subject:
 
 
 def kit_subject(title: str, kit: Kit) -> Subject:
-    """A kit on the table. All tools but the last are seated, to show one empty cavity."""
+    """Returns the content of a picture of a kit on the table.
+
+    All tools but the last are seated, to show one empty cavity.
+    """
     seated = [
         (tool.sdf, RigidTransform(RollPitchYaw(0, 0, pose.yaw), [pose.x, pose.y, pose.z]))
         for tool, pose in zip(kit.tools[:-1], kit.layout.poses[:-1], strict=True)
