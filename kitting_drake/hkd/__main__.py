@@ -50,7 +50,7 @@ def generate(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
 
 
 def sheet(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
-    """Renders the contact sheet."""
+    """Renders a contact sheet of tools or kits."""
     # Import Drake lazily, because it is slow to import.
     from kitting_drake.hkd.kits.kit import make_kit
     from kitting_drake.hkd.kits.parameters import KitParameters
@@ -228,7 +228,7 @@ def _check_scenario(path: Path, console: Console) -> bool:
 
 
 def _reach_note(scenario: Scenario, base: Path) -> str:
-    """Returns a sentence on the number of scenes in which an arm reaches all of a kit.
+    """Says in how many of `_SCENES` scenes an arm reaches all tools and cavities of a kit.
 
     Raises:
         UserError: the arm cannot reach its home.

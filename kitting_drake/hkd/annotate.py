@@ -1,5 +1,7 @@
-"""A Meshcat page on which a user moves a gripper over a tool and saves a grasp (`hkd annotate
-NAME`)."""
+"""A Meshcat page on which a user moves a gripper over a tool and saves a grasp.
+
+The command `hkd annotate NAME` serves the page.
+"""
 
 import dataclasses
 import math
@@ -87,7 +89,7 @@ def save_grasp(tool: Tool, grasp: Grasp, models: Path = MODELS) -> None:
         record["grasp"] = {key: round(value, 6) for key, value in dataclasses.asdict(grasp).items()}
         # Drop the other grasps: they were chosen to complement the previous annotated grasp.
         record.pop("other_grasps", None)
-        # Mark the grasp, so that a repeated import keeps it.
+        # Mark the grasp, so that a repeated import does not overwrite it.
         record["annotated"] = True
         write_atomically(record_path, yaml.safe_dump(record, sort_keys=False))
         return

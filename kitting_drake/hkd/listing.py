@@ -13,7 +13,7 @@ from kitting_drake.hkd.generation.catalogue import CatalogueError, ToolEntry
 from kitting_drake.hkd.tools.tool import load_tool, user_tool_names, user_tools
 
 _LIST_WIDTH = 1000
-"""The number of columns of a terminal that truncates no cell."""
+"""A width of the console, in columns, at which no cell is truncated."""
 
 
 def chosen_entries(entries: list[ToolEntry], names: list[str]) -> list[ToolEntry]:

@@ -81,7 +81,7 @@ class Subject:
 
 
 def tool_subject(tool: Tool) -> Subject:
-    """Returns the content of a picture of a tool at rest on the table."""
+    """Returns the subject of a picture: a tool at rest on the table."""
     title = tool.name.replace("_", " ")
     # View tools that are larger than the dataset's from farther away.
     size = 0.208 * max(1.0, tool.length / 0.2, tool.width / 0.13)
@@ -89,7 +89,7 @@ def tool_subject(tool: Tool) -> Subject:
 
 
 def kit_subject(title: str, kit: Kit) -> Subject:
-    """Returns the content of a picture of a kit on the table.
+    """Returns the subject of a picture: a kit on the table.
 
     All tools but the last are seated, to show one empty cavity.
     """

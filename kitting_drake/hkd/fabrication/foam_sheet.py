@@ -22,7 +22,7 @@ MOST_KITS = 60
 """The largest number of kits on a sheet."""
 
 _MIXTURES = 40
-"""The number of random choices of which copies are turned that are tried."""
+"""The number of packings in which the turned copies are chosen at random."""
 _SHEET, _BLOCK = "SHEET", "BLOCK"
 _STROKES = ("#0b5fa5", "#2b8a3e", "#9c36b5", "#d9480f", "#087f5b", "#a61e4d", "#5f3dc4")
 _COLOURS = (4, 3, 6, 30, 2, 1, 150, 80)
@@ -162,7 +162,10 @@ def fill_sheet(
 
 
 def _merit(places: Sequence[KitPlace], kits: Sequence[SheetKit]) -> tuple[int, float]:
-    """Returns what a better packing has more of: different kits on the sheet, then covered area."""
+    """Returns the number of different kits on the sheet and the covered area in mm^2.
+
+    The best packing has the greatest of these tuples.
+    """
     present = len({place.kit for place in places})
     return present, sum(math.prod(kits[place.kit].size) for place in places)
 
@@ -206,7 +209,7 @@ def _packed(
         kits: the kits.
         order: the indices of the kits to place.
         turned: whether each kit in `order` is turned; None: as it fits best.
-        by_rows: whether to place each kit as low as possible, or else as far left as possible.
+        by_rows: whether each kit goes as low as possible; if not, it goes as far left as possible.
     """
     places: list[KitPlace] = []
     boxes = np.empty((0, 4))

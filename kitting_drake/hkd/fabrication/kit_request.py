@@ -54,7 +54,7 @@ class KitRequest:
     lead_in_mm: float | None = None
     """The width of the bevel around the rims. None: the template's 1 mm."""
     fit_of: tuple[tuple[str, float], ...] = ()
-    """Pairs of a tool's name or path, and the clearance of this tool instead of `clearance_mm`."""
+    """Pairs of a tool's name or path, and this tool's clearance, which replaces `clearance_mm`."""
     stand_out_mm: float = 0.0
     """The height of the tools' tops above the block's top."""
     wall_mm: float | None = None

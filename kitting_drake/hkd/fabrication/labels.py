@@ -25,7 +25,7 @@ _CELL = 0.0007
 _FARTHEST = 0.03
 """The largest distance of a label from its cavity, in metres."""
 _PLAINLY = 1.5
-"""The least ratio of a label's distance from other cavities to that from its own cavity."""
+"""A label must be farther from any other cavity than from its own cavity, by this factor."""
 # The cost of a label's position, in metres, is the sum of: its distance from the cavity; a tenth of
 # its distance from the cavity's middle; 6 mm if the text is rotated; and minus 6 times the height
 # of its letters.
@@ -35,7 +35,7 @@ _FONT_SIZE = 100.0
 
 @dataclass(frozen=True)
 class _Lettering:
-    """A text with letters of one height and its lower left corner at the origin, in metres."""
+    """The outline of a text in metres, with its lower left corner at the origin."""
 
     outline: CrossSection
     cap_height: float

@@ -35,7 +35,7 @@ class Outside:
     chamfer_mm: float = 0.0
     """The width of the bevel along the block's outer edges; zero for none."""
     gridfinity: bool = False
-    """Whether the block stands on Gridfinity's feet. `grid_side` gives the sides for these."""
+    """Whether the block stands on Gridfinity's feet. Its sides are then those of `grid_side`."""
 
     @property
     def raised_mm(self) -> float:

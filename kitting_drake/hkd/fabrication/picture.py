@@ -21,7 +21,7 @@ _SHADOW = (0.20, 0.08, 0.0)
 _LIGHT = np.array([-0.45, 0.55, 0.70]) / np.linalg.norm([-0.45, 0.55, 0.70])
 """The unit vector towards the light, in the kit frame."""
 _ROOMIEST = 0.032
-"""The largest distance from a cavity's wall at which a place for the depth is sought, in metres."""
+"""The largest distance from a cavity's wall that is tried for the text of its depth, in metres."""
 _INCHES = 7.5
 """The width of each of the two views, in inches."""
 
@@ -118,7 +118,7 @@ def _draw_block(axes: Any, design: Design) -> None:
         floor = (1 - share) * _SHALLOW + share * _DEEP
         _fill(axes, design, recess.outline, tuple(floor))
         depth = 1e-3 * design.depth_mm(recess)
-        # A cavity and its notches are drawn together, because no wall between them casts a shadow.
+        # Draw the shadow of a cavity and its notches as one, because there is no wall between them.
         opening = CrossSection()
         for other in order:
             if other.tool == recess.tool:

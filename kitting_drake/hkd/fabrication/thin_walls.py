@@ -80,7 +80,7 @@ def undercut_notes(solid: Manifold, design: Design) -> list[str]:
 def _vanished(
     design: Design, recesses: Sequence[Recess], room: CrossSection
 ) -> Iterator[tuple[str, str]]:
-    """Finds missing walls, where a cavity overlaps another one or the block's side.
+    """Finds missing walls, where a cavity overlaps another cavity or the block's side.
 
     Yields:
         A text that names the two things that the wall should divide, and a sentence for the user.

@@ -252,7 +252,7 @@ def bracket(length: float, width: float, height: float) -> PartDesign:
     # The fingers close beside the short leg.
     x = min(_middle_of_mass(parts)[0], length / 2 - thick - 12.0)
     if x < -length / 2:
-        raise PartError(f"its long leg of {length:g} mm is too short for the jaws")
+        raise PartError(f"the long leg of {length:g} mm is too short for the jaws")
     return PartDesign(parts, PartGrasp(thick, height, x, (thick - width) / 2), 1)
 
 
@@ -399,23 +399,25 @@ def design_part(kind: str, dimensions: tuple[float, ...]) -> PartDesign:
     """
     known = PART_KINDS[kind]
     if len(dimensions) != len(known.default):
-        raise PartError(f"give {known.dimensions} in mm")
+        raise PartError(f"give the dimensions {known.dimensions} in mm")
     if not all(2.0 <= value <= LONGEST_MM for value in dimensions):
         raise PartError(f"each dimension must be 2 to {LONGEST_MM:g} mm")
     design = known.design(*dimensions)
     top = max(float(hull[:, 2].max()) for part in design.parts for hull in part.hulls)
     if top < THINNEST_MM - 1e-6:
-        raise PartError(f"it is {top:g} mm high, but the hand needs at least {THINNEST_MM:g} mm")
+        raise PartError(
+            f"the part is {top:g} mm high, but the hand needs at least {THINNEST_MM:g} mm"
+        )
     if not 3.0 <= design.grasp.width_mm <= WIDEST_MM:
         raise PartError(
-            f"it is {design.grasp.width_mm:.1f} mm wide where it is held; the jaws hold 3 to "
-            f"{WIDEST_MM:g} mm"
+            f"the part is {design.grasp.width_mm:.1f} mm wide where it is held, but the jaws hold "
+            f"3 to {WIDEST_MM:g} mm"
         )
     return design
 
 
 def _light(length: float) -> str:
-    """Returns the material of a solid part: steel, or aluminium if steel would be too heavy."""
+    """Returns the material of a solid part: steel, or painted aluminium for a large part."""
     return "red_enamel" if length > 60 else "steel"
 
 
@@ -432,7 +434,7 @@ def _prism(profile: np.ndarray, height: float) -> Shape:
 
 
 def _around(profile: np.ndarray) -> CrossSection:
-    """Returns a square that contains every profile. As the only cell, it makes one hull."""
+    """Returns a square that contains every profile. With this cell alone, a plate has one hull."""
     return CrossSection.square((2 * LONGEST_MM, 2 * LONGEST_MM), True)
 
 

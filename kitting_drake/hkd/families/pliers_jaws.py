@@ -1,7 +1,7 @@
 """Outlines of the upper jaw of pliers, by kind; the lower jaw is its mirror image.
 
 The points of an outline run clockwise from the joint over the back to the tip, and return along the
-edge that bites.
+biting edge.
 """
 
 from collections.abc import Callable

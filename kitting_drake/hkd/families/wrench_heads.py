@@ -140,7 +140,7 @@ def _open(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape:
         ],
         [apex, corner, 1.0, 0.0, 0.0, 1.0, corner],
     )
-    # Use one cell for each jaw, and two for the halves behind the floor.
+    # Use one cell for each jaw, and one for each half of the disc behind the slot.
     far, floor = 2.0 * radius, -depth + 0.2 * half
     cells = [
         _rectangle(floor, far, half, far),

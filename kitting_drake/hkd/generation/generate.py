@@ -299,7 +299,7 @@ def _measure_grasp(entry: ToolEntry, solid: Manifold) -> _GripReport:
         # this offset.
         raise CatalogueError(
             f"{named} is not centred between the gripped faces: move it by "
-            f"{pad.middle:+.2f} mm along the jaws"
+            f"{pad.middle:+.2f} mm along the direction in which the jaws close"
         )
     return _GripReport(
         width=pad.width,

@@ -23,8 +23,8 @@ _CORNER_MARGIN, _CORNER_OFFSET = 0.002, 0.0005
 # A taper is held if the slope of its faces along the pads is at most `_TAPER`, measured over
 # `_TAPER_LENGTH` (m).
 _TAPER, _TAPER_LENGTH = float(np.tan(np.radians(24.0))), 0.004
-# A corner opposite a face costs `_CORNER_COST`, and up to `_NOT_FLAT_COST` more the less of the pad
-# the face touches. A taper costs `_TAPER_COST`, and up to `_SLOPE_COST` more the steeper it is. Two
+# A corner opposite a face costs `_CORNER_COST`, plus up to `_NOT_FLAT_COST` if the face touches
+# only part of its pad. A taper costs `_TAPER_COST`, plus up to `_SLOPE_COST` for its slope. Two
 # opposite corners, between which the tool may turn, cost `_TWO_CORNERS_COST`.
 _CORNER_COST, _NOT_FLAT_COST = 0.5, 2.0
 _TAPER_COST, _SLOPE_COST = 0.8, 0.5

@@ -181,9 +181,9 @@ def _between_fingers(
 def _contact(
     touch_left: NDArray[np.bool_], touch_right: NDArray[np.bool_], at_corner: bool
 ) -> tuple[float, float]:
-    """Returns the mean number of levels that touch, and the offset between the mean contacts.
+    """Returns the mean number of levels that touch, and the offset between the pads' contacts.
 
-    The offset is along the pads, in metres.
+    The offset is that of the mean points of contact along the pads, in metres.
 
     Args:
         touch_left: (columns, levels) where the left pad touches.

@@ -2,9 +2,9 @@
 
 The hand comes from above, and its jaws close on the part of the surface between them that stands
 out farthest. For a rotation theta of the hand and a position u along its pads, only the tool's
-extents to either side matter, at each height. Horizontal slices of the tool give these extents. The
-position along the closing direction follows from them, because a grasp is centred between the
-gripped faces.
+extents to the left and right at each height matter. Horizontal slices of the tool give these
+extents. The position along the closing direction follows from them, because a grasp is centred
+between the gripped faces.
 """
 
 from dataclasses import dataclass, field, replace
@@ -46,8 +46,8 @@ _LANE = 0.040
 _STEP = 0.001
 _COARSE_DEG, _FINE_DEG = 5.0, 0.5
 _MOST_PROPOSALS = 12
-# A proposal is dropped if both its distance (m) and its rotation (rad) from a better one are less
-# than this.
+# A proposal is dropped if it differs from a better one by less than these limits, in position (m)
+# and in rotation (rad).
 _DISTINCT, _DISTINCT_ANGLE = 0.012, np.radians(20.0)
 
 
@@ -58,9 +58,9 @@ class GraspProposal(Grasp):
     offset: float
     """The horizontal distance between the centre of mass and the grasp, in metres."""
     contact: float
-    """The share of the pads' length, 0 to 1, along which both touch."""
+    """The share of the pads' length, 0 to 1, along which both pads touch."""
     depth: float
-    """The share of the pads' height below the tool's top, 0 to 1, over which both touch."""
+    """The share of the pads' height below the tool's top, 0 to 1, over which both pads touch."""
     slope: float
     """The inward lean of the gripped faces at the pads' lower edges, in radians."""
     overhang: float

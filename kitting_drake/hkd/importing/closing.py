@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Faces = NDArray[np.int64]
 
-# The largest distance of an opening's rim from the plane fitted to it, because the rims of scans
-# are not straight.
+# The largest distance of an opening's rim from the plane fitted to it. The rims of scans are not
+# quite flat.
 _FLAT_MM = 2.0
 
 

@@ -113,7 +113,7 @@ def _notches(part: CrossSection) -> list[Array]:
 def _grown(seed: int, cells: list[CrossSection], outer: CrossSection) -> set[int]:
     """Grows a hull within `outer` from the cell `seed` and returns the indices of its cells.
 
-    Each step adds the cell with which the hull covers the least area outside the cells.
+    Each step adds the cell for which the hull gains the least area besides the cell itself.
     """
     hull, members, candidates = cells[seed].hull(), {seed}, set(range(len(cells))) - {seed}
     while True:

@@ -19,8 +19,8 @@ from kitting_drake.hkd.tools.solids import SEGMENTS
 from systems.grasp import Grasp
 
 MOST_HULLS = 16
-"""The largest number of hulls of a tool. It is exceeded only if the outline needs more even at the
-last of `OUTLINE_TOLERANCES_MM`."""
+"""The largest number of hulls of a tool. It is exceeded only if the outline needs more even with
+the last of `OUTLINE_TOLERANCES_MM`."""
 OUTLINE_TOLERANCES_MM = ((0.26, 0.12), (0.30, 0.2), (0.4, 0.2), (0.6, 0.3), (0.9, 0.3))
 """Pairs of tolerances of the hulls, for the outline and for the gripped faces, before vertices are
 thinned. A pair is tried if the one before it needs too many hulls."""
@@ -94,8 +94,7 @@ def _within(solid: Manifold, polygon: CrossSection) -> Manifold:
 
 
 def _split_by_height(parts: list[Manifold]) -> list[Manifold]:
-    """Cuts in two the parts whose hulls add the most volume, as far as the number of hulls
-    allows."""
+    """Cuts the parts whose hulls add too much volume in two, up to `MOST_HULLS` parts."""
     parts = [part for part in parts if part.volume() >= _SMALLEST_VOLUME]
     most = ADDED_SHARE * sum(part.volume() for part in parts)
     added = [_added_volume(part) for part in parts]

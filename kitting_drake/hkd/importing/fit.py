@@ -65,7 +65,7 @@ def true_length(
         return real, f"in {unit}: {real:.1f} mm long"
     lengths = {name: length * mm for name, mm in UNITS_MM.items()}
     units = [name for name, real in lengths.items() if SHORTEST_MM <= real <= LONGEST_MM]
-    # Drop the units in which the tool is too thin or too high, unless it is so in all units.
+    # Drop the units in which the tool is too thin or too high, unless this would drop all units.
     units = [u for u in units if THINNEST_MM <= height * UNITS_MM[u] <= HIGHEST_MM] or units
     if len(units) == 1:
         return lengths[units[0]], f"taken to be in {units[0]}: {lengths[units[0]]:.1f} mm long"

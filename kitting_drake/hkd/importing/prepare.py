@@ -97,7 +97,7 @@ def _prepare(request: ImportRequest, name: str, directory: Path, say: Say) -> Pr
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     longest = float((high - low).max())
     if not longest > 1e-12:
-        raise UserError("the mesh has no extent")
+        raise UserError("the mesh has no extent: all of its points are the same")
     nominal = NOMINAL_MM / longest
     say(f"repairing its {len(faces)} triangles")
     solid, notes = make_solid((vertices - (low + high) / 2) * nominal, faces)

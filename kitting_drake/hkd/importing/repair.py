@@ -56,7 +56,7 @@ def make_solid(vertices: Array, faces: Faces) -> tuple[Manifold, list[str]]:
     """
     vertices, faces = _merged(vertices, faces)
     if len(faces) < 4:
-        raise UserError("the mesh encloses no volume")
+        raise UserError("the mesh encloses no volume: repair it first")
     notes: list[str] = []
     components = trimesh.graph.connected_components(
         trimesh.graph.face_adjacency(faces), nodes=np.arange(len(faces)), min_len=1
@@ -93,7 +93,7 @@ def make_solid(vertices: Array, faces: Faces) -> tuple[Manifold, list[str]]:
                 "file is complete"
             )
     if solid.is_empty() or solid.volume() < _HOLLOW * _box_volume(solid):
-        raise UserError("the mesh encloses no volume")
+        raise UserError("the mesh encloses no volume: repair it first")
     solid = _one_thing(solid, notes)
     if hollows:
         notes.append(f"kept {len(hollows)} sealed {'hollow' if len(hollows) == 1 else 'hollows'}")

@@ -78,8 +78,9 @@ def size(solid: Manifold) -> Array:
 
 
 def _lowest_pose(vertices: Array, com: Array) -> StablePose:
-    """Returns the stable pose with the lowest centre of mass; of equally low ones, that with the
-    broadest support.
+    """Returns the stable pose with the lowest centre of mass.
+
+    Of equally low poses, it is the one with the broadest support.
 
     Raises:
         UserError: there is no stable pose.
@@ -87,9 +88,9 @@ def _lowest_pose(vertices: Array, com: Array) -> StablePose:
     try:
         poses = stable_poses(vertices, com)
     except (QhullError, ValueError) as error:
-        raise UserError("the mesh encloses no volume") from error
+        raise UserError("the mesh encloses no volume: repair it first") from error
     if not poses:
-        raise UserError("the mesh has no stable pose")
+        raise UserError("the mesh has no stable pose: repair it first")
     lowest = min(pose.height for pose in poses)
     good = [pose for pose in poses if pose.height < lowest + _EQUAL_HEIGHT_MM]
     # If poses are still equal, choose the one nearest to the pose in the file.

@@ -59,8 +59,10 @@ class NestedShape:
 
 @dataclass(frozen=True)
 class NestedPose:
-    """The pose of a shape: its frame's origin from the rectangle's centre in metres, and its
-    angle."""
+    """The pose of a shape on a rectangle.
+
+    (x, y) is the origin of the shape's frame relative to the rectangle's centre, in metres.
+    """
 
     x: float
     y: float
@@ -87,7 +89,7 @@ def nest(shapes: Sequence[NestedShape], wall: float) -> Nesting | None:
     only if there is no other. The result is deterministic.
 
     Args:
-        shapes: at least one shape.
+        shapes: the shapes, at least one.
         wall: the least distance between two outlines, and of an outline from the rectangle's edge,
             in metres.
     """
@@ -119,7 +121,7 @@ def nest_on(
     """Places shapes on a rectangle of a given size, or returns None if no placement is found.
 
     Args:
-        shapes: at least one shape.
+        shapes: the shapes, at least one.
         wall: the least distance between two outlines, and of an outline from the rectangle's edge,
             in metres.
         room: the rectangle's length along x and width along y, in metres.

@@ -66,7 +66,7 @@ def shapes_of(split: str) -> list[OutlinedShape]:
 
 
 def shape_tool(shape: OutlinedShape) -> Tool:
-    """Returns the tool of one of the project's shapes; makes it at the first call.
+    """Returns the tool of one of the project's shapes. The tool is made at the first call.
 
     Raises:
         UserError: the cache cannot be written.
@@ -92,7 +92,7 @@ def shape_files(folder: Path) -> list[Path]:
     """
     kinds = ", ".join(suffix[1:].upper() for suffix in FORMATS)
     if not folder.is_dir():
-        raise UserError(f"there is no folder {folder}")
+        raise UserError(f"there is no folder {folder}: give a folder with meshes ({kinds})")
     found = sorted(path for path in folder.iterdir() if path.suffix.lower() in FORMATS)
     if not found:
         raise UserError(f"{folder} has no meshes ({kinds})")
@@ -100,7 +100,9 @@ def shape_files(folder: Path) -> list[Path]:
 
 
 def imported_shape(path: Path, scale: Sequence[float] = RAVENS_SCALE) -> Tool:
-    """Returns the tool of a flat shape's mesh, which lies with z up; makes it at the first call.
+    """Returns the tool of a mesh that is a flat shape with z up.
+
+    The tool is made at the first call.
 
     Args:
         path: the mesh.
@@ -136,7 +138,7 @@ def _solid(path: Path, scale: Sequence[float]) -> Manifold:
     vertices = 1e3 * np.asarray(scale) * vertices
     extent = float(np.ptp(vertices, axis=0).max())
     if not 1e-9 < extent < np.inf:
-        raise UserError("the mesh has no extent")
+        raise UserError("the mesh has no extent: all of its points are the same")
     factor = NOMINAL_MM / extent
     solid, _ = make_solid(factor * vertices, faces)
     return solid.scale([1 / factor] * 3)

@@ -64,7 +64,7 @@ def tool_sdf(
         name: the name of the model.
         mass: the mass in kg.
         center: (3,) the centre of mass in T, in m.
-        inertia: (3, 3) about the centre of mass, in kg m^2.
+        inertia: (3, 3) the inertia about the centre of mass, in kg m^2.
         visuals: pairs of an OBJ file and a key of MATERIALS.
         collisions: OBJ files of convex hulls.
         modulus: Drake's hydroelastic modulus, in Pa.

@@ -143,7 +143,7 @@ def ribbon(path: np.ndarray, widths: np.ndarray) -> np.ndarray:
 
 
 def blend(profile: CrossSection, inner_radius: float, outer_radius: float = 0.0) -> CrossSection:
-    """Rounds concave corners to `inner_radius`, and convex corners to `outer_radius`."""
+    """Rounds a profile's concave corners to `inner_radius`, its convex ones to `outer_radius`."""
     for radius in (inner_radius, -outer_radius):
         profile = profile.offset(radius, JoinType.Round, circular_segments=SEGMENTS)
         profile = profile.offset(-radius, JoinType.Round, circular_segments=SEGMENTS)
@@ -297,7 +297,10 @@ def across_x(profile: np.ndarray, x: float, y: float = 0.0, z: float = 0.0) -> n
 
 
 def across_path(profile: np.ndarray, point: ArrayLike, angle: float) -> np.ndarray:
-    """Returns a section (n, 3) of a loft in the xy plane at `point`, at `angle` (rad) from +x."""
+    """Returns a section (n, 3) of a loft along a path in the xy plane.
+
+    At the section, the path passes through `point` (2,) in the direction `angle` (rad) from +x.
+    """
     left = np.array([-np.sin(angle), np.cos(angle)])
     xy = np.asarray(point) + profile[:, :1] * left
     return np.column_stack([xy, profile[:, 1]])

@@ -130,10 +130,10 @@ def measure_rotation(
 def _surface_distance(
     triangles: NDArray[np.float64], order: int, start: Shift, *, complete: bool
 ) -> float:
-    """Returns the mean distance of a surface and its rotated copy, minimized from the shift
-    `start`.
+    """Returns the mean distance in mm between a surface and its rotated and shifted copy.
 
-    Unless `complete`, a value of at least `MOST_SURFACE_DISTANCE_MM` may be too low.
+    The shift is the one with the least distance. Its search begins at `start`. Unless `complete` is
+    set, a value of at least `MOST_SURFACE_DISTANCE_MM` may be too low.
     """
     faces = np.arange(3 * len(triangles)).reshape(-1, 3)
     mesh = trimesh.Trimesh(triangles.reshape(-1, 3), faces, process=False)

@@ -45,9 +45,11 @@ class Tool:
     """The split: `train` or `test` (section IV-B.1 of the paper), `fresh` (reserved for a final
     test), or `user` for a user's own tool."""
     length: float
-    """The extents of the bounding box along x, y and z of T, in metres."""
+    """The extent of the bounding box along x of T, in metres."""
     width: float
+    """The extent of the bounding box along y of T, in metres."""
     height: float
+    """The extent of the bounding box along z of T, in metres."""
     mass: float
     """The mass in kg."""
     grasp: Grasp
@@ -128,7 +130,7 @@ def _read_triangles(path: Path) -> NDArray[np.float64]:
     except (OSError, ValueError, TypeError, AttributeError, IndexError, KeyError) as error:
         raise UserError(f"{path} is not a readable mesh: {error}") from error
     if not len(triangles) or not np.isfinite(triangles).all():
-        raise UserError(f"{path} has no triangles, or vertices that are not finite")
+        raise UserError(f"{path} has no triangles, or has vertices that are not finite")
     triangles.flags.writeable = False
     return triangles
 
@@ -204,8 +206,7 @@ def load_tool(name: str, base: Path | None = None) -> Tool:
         raise UserError(f"{record_path} is not a tool record: it lacks {error}") from error
     except (TypeError, ValueError, AttributeError) as error:
         raise UserError(
-            f"{record_path} is not a tool record: a field is missing or has a wrong value: import "
-            "the tool again"
+            f"{record_path} is not a tool record: a field has a wrong value ({error})"
         ) from error
     for path in (tool.sdf, *tool.visual_meshes):
         if not path.is_file():

@@ -55,7 +55,7 @@ def plane_of_scale(cv2: Any, photo: Photo, scale: Scale, camera_mm: float | None
         camera_mm: the camera's height above the plane in mm; None: computed from the focal length.
 
     Raises:
-        UserError: the object is not seen, or is seen twice, or the photo is oblique.
+        UserError: the object is not visible, or there are several, or the flags are wrong.
     """
     if scale.board is not None:
         return _by_board(cv2, photo, scale, camera_mm)

@@ -22,7 +22,7 @@ _LEAST_LOOP_MM2 = 4.0
 _LEAST_TOOL_MM2 = 60.0
 _FLAT_MM = 0.03
 _EDGE_SLACK_MM = 0.4
-"""Half the width, in mm, of the strips between two masks that are ignored."""
+"""Half the width, in mm, up to which a strip in which two masks differ is ignored."""
 
 
 @dataclass(frozen=True)
@@ -184,7 +184,7 @@ def _soft(cv2: Any, light: Array, mask: Array, ppm: float) -> Array:
 
 
 def _spread_colour(cv2: Any, light: Array, where: Array, ppm: float) -> Array:
-    """Averages the colours of the pixels in a mask around each pixel.
+    """Averages, around each pixel, the colours of the pixels that are in a mask.
 
     Returns:
         The mean colour, and the share of nearby pixels that are in the mask, (rows, columns, 4).

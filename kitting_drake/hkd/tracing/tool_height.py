@@ -19,9 +19,9 @@ def outline_of_silhouette(
 
     Let the camera be at height H above the plane, and the tool t high. A point at height h appears
     H / (H - h) times as far from the point below the camera. Where an upright side faces away from
-    that point, the camera sees its top. Where it faces that point, the camera sees its foot. So the
-    outline is the part of the plane that the silhouette covers at every scale from 1 to
-    (H - t) / H. The widest points of a round tool are at height t / 2 on all sides, so its
+    that point, the camera sees the side's top. Where the side faces that point, the camera sees its
+    foot. So the outline is the part of the plane that the silhouette covers at every scale from 1
+    to (H - t) / H. The widest points of a round tool are at height t / 2 on all sides, so its
     silhouette is scaled only once.
 
     Args:

@@ -81,7 +81,7 @@ def look_for(height: float | None, px_per_mm: float) -> ShadowLook:
 
 
 class ToolMasks:
-    """Separates the tools in one photo from the ground, with the limits of any look."""
+    """Computes masks of the tools in one photo, for different looks."""
 
     def __init__(
         self, cv2: Any, ratio: Array, ground: Array, spread: float, px_per_mm: float
@@ -146,9 +146,9 @@ class ToolMasks:
         return self._bordered(self._without_shine(tool, widest))
 
     def shine(self, mask: Array) -> Array:
-        """Returns a mask (rows, columns): 1 beside the given mask where ground is not so bright.
+        """Returns a mask (rows, columns): 1 for the pixels beside a given mask that are too bright.
 
-        Such pixels are probably reflections on a tool.
+        The ground is not as bright, so these pixels are probably reflections on a tool.
         """
         cv2 = self._cv2
         near = cv2.dilate(mask, _disc(cv2, _SHINE_REACH_MM * self._px_per_mm))

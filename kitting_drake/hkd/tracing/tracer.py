@@ -41,7 +41,7 @@ _DOUBTED_MM = 0.12
 this, in mm."""
 _MOST_DOUBTS = 4
 _APART_MM = 15.0
-"""Silhouettes closer than this, in mm, may be of one tool."""
+"""Silhouettes closer than this, in mm, may belong to one tool."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ def trace(request: TraceRequest) -> TraceReport:
     """Traces the tools of a photo and writes their outlines and a picture.
 
     Raises:
-        UserError: the photo cannot be read reliably; nothing was written then.
+        UserError: the photo cannot be read reliably. Nothing is written then.
         MachineError: OpenCV or ezdxf is missing.
     """
     cv2 = import_extra("cv2", purpose="hkd trace", extra="camera")

@@ -40,7 +40,7 @@ _ROOMY = 4.0
 _STEEPEST = 4
 """The largest sideways step of a cut for each step forward, in cells."""
 _UPRIGHT_ENDS = 6.0
-"""The length of both ends of a cut in mm, on which it is perpendicular to the block's side."""
+"""A cut begins and ends perpendicular to the block's sides, for this length in mm."""
 _REPAIRS = 8
 """The largest number of attempts to find cuts that leave no thin wall."""
 _BARRED = 400.0
@@ -99,7 +99,7 @@ def _counts(
     Args:
         size: the block's length and width, in mm.
         bed: the sides of the bed, in mm.
-        extra: the number of columns and rows of pieces in addition to the least possible ones.
+        extra: how many columns and rows of pieces to try in addition to the least possible number.
     """
     options = []
     for turned in dict.fromkeys((bed, bed[::-1])):
@@ -168,7 +168,7 @@ class _Cutter:
         return price + _LABEL * self._mask(labels.offset(0.8, JoinType.Round))
 
     def _foot_prices(self, feet: Sequence[CrossSection]) -> NDArray[np.float64]:
-        """Returns the cost per mm through each cell that the feet add (rows, columns)."""
+        """Returns the cost per mm (rows, columns) that the feet add to a cut through each cell."""
         price = np.zeros(self._counts)
         if feet:
             inside = self._mask(feet[0])

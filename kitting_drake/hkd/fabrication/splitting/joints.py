@@ -142,7 +142,7 @@ def _spread(
 def _keeps_walls(
     joint: Joint, regions: Sequence[CrossSection], feet: Sequence[CrossSection]
 ) -> bool:
-    """Whether no wall beside a joint is thinner than `LEAST_WALL`, in the pieces and their feet."""
+    """Whether all walls beside a joint, in its two pieces and their feet, are thick enough."""
     near = joint.outline.offset(4 * _MARGIN, JoinType.Miter)
     owner, other = (regions[i] ^ near for i in (joint.owner, joint.other))
     inner = joint.outline.offset(2 * _MARGIN, JoinType.Miter)

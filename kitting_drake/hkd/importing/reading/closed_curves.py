@@ -38,12 +38,12 @@ _BOX = 0.9
 """The least share of its bounding box that a rectangle fills, even if its corners are round."""
 _THE_PAGE = "the page"
 _PAGE = 0.85
-"""The least ratio of a rectangle's sides to the page's sides if the rectangle is the page."""
+"""A rectangle is the page if the ratios of their sides are between this and its reciprocal."""
 _HOLE, _TOOL = 0.25, 0.4
 """Shares of a rectangle's length. A curve in the rectangle that is shorter than `_HOLE` is a hole,
 and a curve that is longer than `_TOOL` may be a tool."""
 _ROUND = 0.02
-"""The largest relative difference of a round hole from a circle."""
+"""The largest relative difference of a round curve from a circle."""
 
 Points = NDArray[np.float64]
 
@@ -121,7 +121,7 @@ def enclosed(
             )
     inner = outer.offset(-_LINE_MM, JoinType.Round)
     for hole in holes:
-        # If the same curve is drawn as a fill and as a line, the second is not a hole.
+        # A curve that is drawn twice, as a fill and as a line, is no hole.
         if hole.area() >= 0.999 * areas[0].area():
             continue
         if (inner - hole).area() < 0.001 * inner.area():

@@ -30,8 +30,8 @@ class Curve:
     element: int | None = None
     """The number of the filled element to which the curve belongs.
 
-    The curves of one element that lie inside another of its curves are holes. None: the curve is
-    not filled, or its element is not known.
+    The inner curves of an element are holes. None: the curve is not filled, or its element is not
+    known.
     """
 
 

@@ -33,7 +33,7 @@ def read_stl(path: Path) -> NDArray[np.float64]:
     if _is_text(data):
         return _text_triangles(data, path)
     if len(data) < _HEADER:
-        raise UserError(f"{path} cannot be read as STL: it is too short")
+        raise UserError(f"{path} is too short for an STL: copy or export it again")
     (count,) = struct.unpack_from("<I", data, _HEADER - 4)
     present, rest = divmod(len(data) - _HEADER, _TRIANGLE.itemsize)
     # Programs that write triangles one by one may leave a count of 0 or of 0xffffffff.

@@ -74,7 +74,7 @@ def svg_curves(path: Path, unit_mm: float | None = None) -> DrawnCurves:
 
 
 def _filling(shape: Any, number: int) -> tuple[bool, int | None]:
-    """Returns whether a shape is filled, and its number if it is."""
+    """Returns whether a shape is filled, and `number` if it is filled, else None."""
     filled = _is_painted(shape.fill)
     return filled, number if filled else None
 
@@ -143,7 +143,8 @@ def _paper(sides: list[float]) -> tuple[str, float]:
         sides: the page's sides in units, the shorter first.
 
     Returns:
-        The names of the sheet and the unit, and the unit's length in mm; or "" and 1.
+        A phrase that names the sheet and the unit, and the unit's length in mm. If there is none,
+        "" and 1.
     """
     for paper, short, long in PAPERS_MM:
         for unit, mm in (("mm", 1.0), *((f"1/{n} inch", 25.4 / n) for n in _RESOLUTIONS)):
