@@ -162,9 +162,9 @@ def fill_sheet(
 
 
 def _merit(places: Sequence[KitPlace], kits: Sequence[SheetKit]) -> tuple[int, float]:
-    """Returns the number of different kits on the sheet and the covered area in mm^2.
+    """Returns the number of different kits on the sheet, and the area in mm^2 that kits cover.
 
-    The best packing has the greatest of these tuples.
+    The better of two packings has more different kits, or as many and more covered area.
     """
     present = len({place.kit for place in places})
     return present, sum(math.prod(kits[place.kit].size) for place in places)

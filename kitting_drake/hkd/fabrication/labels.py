@@ -140,7 +140,7 @@ def _placed(
     raster: _Raster,
     costs: NDArray[np.float64],
 ) -> CrossSection | None:
-    """Finds the cheapest placement of a text at which its bounding box is free.
+    """Finds the cheapest placement of a text whose bounding box covers only free cells.
 
     Args:
         choices: the same text at several sizes and rotations.
@@ -150,7 +150,7 @@ def _placed(
             infinite where that is forbidden.
 
     Returns:
-        The outlines of the placed letters in the kit frame; None if no placement is free.
+        The outlines of the placed letters in the kit frame; None if no placement is possible.
     """
     blocked = np.pad(np.cumsum(np.cumsum(~free, axis=0), axis=1), ((1, 0), (1, 0)))
     best, lowest = None, np.inf

@@ -217,7 +217,7 @@ def _tool_frame(
 def _collision_hulls(
     parts: list[Part], R_TD: np.ndarray, p_T: np.ndarray, outline: CrossSection, grasp: GraspEntry
 ) -> list[np.ndarray]:
-    """Returns the collision hulls (n, 3) in T in mm, in a deterministic order."""
+    """Returns the vertices (n, 3) of each collision hull, in T in mm, in a deterministic order."""
     hulls = [h @ R_TD.T + p_T for part in parts for h in part.hulls]
     covering = cover(hulls, outline, _allowed(outline, grasp), MERGE_TOLERANCE_MM)
     return sorted(

@@ -42,11 +42,11 @@ class Reach:
     u_min: float
     """The u of the first column; each column is `BIN` long."""
     left: Array
-    """(columns, levels) the greatest v; -inf where the tool is absent."""
+    """The greatest v (columns, levels) of the tool; -inf where the tool is absent."""
     right: Array
-    """(columns, levels) the least v; inf where the tool is absent."""
+    """The least v (columns, levels) of the tool; inf where the tool is absent."""
     levels: Array
-    """(levels) the heights of the slices, equally spaced."""
+    """The heights (levels) of the slices, equally spaced."""
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ SLOTS = {
     "wrench": (0.0, -0.09),
     "screwdriver": (0.0, 0.09),
 }
-"""(x, y) of each category's tool frame T in the kit frame, in metres."""
+"""The origin (x, y) of the tool frame T of each category in the kit frame, in metres."""
 
 MOST_TOOLS = 12
 """The largest number of tools in a kit."""

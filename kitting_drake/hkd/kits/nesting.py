@@ -3,7 +3,7 @@
 Shapes are placed one by one, largest first, in strips of several widths. Each shape goes where it
 raises the strip's used height least, and the best strip is kept.
 
-All translations of a shape are tested at once on a raster. A translation is free where the
+All translations of a shape are tested at once on a raster. A translation is possible where the
 cross-correlation of the shape's mask with the mask of the placed shapes is zero; a fast Fourier
 transform computes it for the whole strip. A mask covers every cell that its shape touches, so the
 exact outlines keep their distances.
@@ -191,7 +191,7 @@ class _Part:
         x_min, y_min, x_max, y_max = (walled + keep_out).bounds()
         self.inset = (_cells(y_low - y_min), _cells(x_low - x_min))
         self.corner = np.array([x_low, y_low])
-        """(x, y) of the lower left corner of the outline with its wall, in the rotated frame."""
+        """The lower left corner (x, y) of the outline with its wall, in the rotated frame."""
         start = self.corner - CELL * np.array(self.inset[::-1])
         counts = (_cells(y_max - start[1]), _cells(x_max - start[0]))
         self.solid = rasterized(solid, start, counts)
@@ -317,7 +317,7 @@ def _lowest_place(
     strip: tuple[int, int],
     canvas: tuple[int, int],
 ) -> tuple[int, int] | None:
-    """Returns the lowest free place (row, column) of a part's corner; None if there is none.
+    """Returns the lowest possible place (row, column) of a part's corner, or None.
 
     Of equally low places, it is the leftmost.
     """

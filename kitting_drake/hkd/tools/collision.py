@@ -191,7 +191,7 @@ def cover(
             round(sum(merged[i].volume for i in members & open_hulls), 3) for _, members in grown
         ]
         _, members = grown[int(np.argmax(gains))]
-        # Make the hull of the uncovered members only, because other hulls cover the others.
+        # Make the hull of the uncovered members only, because earlier hulls cover the rest.
         wanted = np.vstack([merged[i].points for i in sorted(members & open_hulls)])
         result.append(wanted)
         open_hulls -= members

@@ -168,7 +168,7 @@ def _grow(
 
 
 def _needed(cells: list[CrossSection], inner: CrossSection) -> list[CrossSection]:
-    """Drops cells, smallest first, that are covered by the others."""
+    """Drops cells without which `inner` is still covered, the smallest first."""
     kept = list(cells)
     for cell in sorted(cells, key=lambda c: c.area()):
         rest = [other for other in kept if other is not cell]

@@ -130,7 +130,7 @@ class ToolMasks:
         roughest = max(_ROUGH * look.rough / 3, look.rough * self._usual)
         even = (free & (self._rough < roughest)) | ~ground
         reached = _reached(cv2, even, self._plain, px_per_mm)
-        # A hole may lie wholly in shadow. Its edges are close, so use the fine roughness.
+        # A hole may lie wholly in shadow. Use a roughness that ignores its edges, which are close.
         usual = _median(self._fine[self._plain & ground], _ROUGH)
         limit = 1.7 * usual * np.exp(-self._lightness / 2)
         like_ground = (self._colour < _NEUTRAL * noise) & (self._fine < limit)

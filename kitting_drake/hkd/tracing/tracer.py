@@ -76,7 +76,7 @@ class TracedTool:
     height_mm: float | None
     svg: Path
     doubts: tuple[Unclear, ...] = ()
-    """Where the outline may be wrong; empty if the photo shows it clearly."""
+    """The regions where the outline may be wrong; empty if the photo shows it clearly."""
 
     @property
     def holes(self) -> int:
