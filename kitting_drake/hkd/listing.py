@@ -47,7 +47,7 @@ def chosen_with_own(
 
 
 def print_tools(models: Path, entries: list[ToolEntry], names: list[str], console: Console) -> None:
-    """Prints a table of generated tools and the user's own, and a line for each broken tool.
+    """Prints a table of the generated tools and the user's tools, and a line for each broken tool.
 
     Args:
         models: the folder with `tools/`.

@@ -183,8 +183,8 @@ def _packings(
     if len(kits) == 1:
         count = min(len(order), int(room[0] * room[1] / areas[0]) + 1)
         order = order[:count]
-        # Turn only the first or only the last copies. Then choose the turned copies at random,
-        # which can find a pinwheel.
+        # Turn the first copies or the last copies, for each number of turned copies. Then turn
+        # copies at random, because the densest packing may be a pinwheel.
         for first, number in itertools.product((False, True), range(count + 1)):
             patterns.append([first] * number + [not first] * (count - number))
         mixtures = np.random.default_rng(0).random((_MIXTURES, count)) < 0.5

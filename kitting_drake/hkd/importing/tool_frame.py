@@ -123,7 +123,7 @@ def long_direction_deg(outline: CrossSection) -> float:
     directions = axis + np.arange(-_SIDEWAYS_DEG, _SIDEWAYS_DEG, 0.25)
     apart = (directions[:, None] - angles + 90.0) % 180.0 - 90.0
     votes = np.exp(-0.5 * (apart / _LIKE_DEG) ** 2) @ lengths
-    # Average the directions of the edges near the best one, which is finer than the search's steps.
+    # To get a finer result than the search's steps, average the edges near the best direction.
     near = apart[int(np.argmax(votes))]
     weights = lengths * np.exp(-0.5 * (near / _LIKE_DEG) ** 2)
     return float(directions[int(np.argmax(votes))] - np.average(near, weights=weights))
