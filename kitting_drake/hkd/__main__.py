@@ -120,7 +120,9 @@ def import_mesh(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
         console.print(f"  {note}")
     console.print(f"  see {report.directory}/outline.png", soft_wrap=True)
     named = d["name"] if args.output is None else report.directory.resolve()
-    console.print(f"files: {report.directory}/; name it '{named}' in a scenario", soft_wrap=True)
+    console.print(
+        f"files: {report.directory}/; its name in a scenario is '{named}'", soft_wrap=True
+    )
 
 
 def trace(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
@@ -331,7 +333,7 @@ def _describe_import(importer: argparse.ArgumentParser) -> None:
     importer.add_argument(
         "--frame",
         metavar="WHAT",
-        help="what a rectangle around the rest of an outline is: page or tool",
+        help="page or tool: what a rectangle is that encloses all other curves of a drawing",
     )
     importer.add_argument("--mass_g", type=float, help="the weighed mass of the tool in grams")
     importer.add_argument(

@@ -152,7 +152,8 @@ def fill_sheet(
         count = sum(place.kit == index for place in placed)
         if count < (copies or 1):
             notes.append(
-                f"{(copies or 1) - count} of {copies or 1} '{kit.name}' find no room on the sheet"
+                f"{(copies or 1) - count} of {copies or 1} copies of '{kit.name}' find no room on "
+                "the sheet"
             )
     heights = sorted({kit.height for kit in kits})
     if len(heights) > 1:

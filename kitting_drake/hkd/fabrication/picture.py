@@ -193,8 +193,10 @@ def _draw_tool(axes: Any, design: Design, index: int) -> None:
 
 
 def _shaded(tool: Tool, yaw: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Returns the upward-facing triangles (n, 3, 3) of a tool in its frame T, and their colours (n,
-    3)."""
+    """Returns the triangles (n, 3, 3) of a tool that face upward, and their colours (n, 3).
+
+    The triangles are in the tool's frame T.
+    """
     triangles = tool.triangles
     normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)

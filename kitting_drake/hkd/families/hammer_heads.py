@@ -230,7 +230,7 @@ def _ball(e: HeadEnd, height: float, thickness: float, start: float) -> tuple[Sh
 def _wedge(e: HeadEnd, height: float, thickness: float, start: float) -> tuple[Shape, None]:
     """Builds a peen, chisel or blade.
 
-    At its edge, it measures `size_mm` along x and `thickness_mm` along z.
+    The edge measures `size_mm` along x and `thickness_mm` along z.
     """
     deep = e.thickness_mm or e.size_mm
     stations = []

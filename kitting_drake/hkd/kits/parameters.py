@@ -1,4 +1,4 @@
-"""The template of a kit."""
+"""The parameters of a kit's block. Their default values are the template of the dataset's kits."""
 
 from dataclasses import dataclass, field, replace
 
@@ -12,7 +12,7 @@ _FINEST = 5e-6
 
 @dataclass
 class KitParameters:
-    """The template of the kit block. Lengths in m."""
+    """The parameters of a kit's block. Lengths in m."""
 
     # The block's extents along x, y and z. A nested block has this length and width only if
     # `fixed_size` is set.

@@ -1,8 +1,7 @@
 """Makes tools from flat shapes: the project's own shapes, and the meshes in a folder.
 
-The tools are stored in the cache.
 A shape lies as it was drawn, with z up. All shapes are of plastic, each in its own colour. The
-collision hulls follow the outline and keep its holes.
+collision hulls follow the outline and keep its holes. The tools are stored in the cache.
 """
 
 import hashlib
@@ -134,7 +133,7 @@ def imported_shape(path: Path, scale: Sequence[float] = RAVENS_SCALE) -> Tool:
 def _solid(path: Path, scale: Sequence[float]) -> Manifold:
     """Returns the solid of a mesh, in mm."""
     vertices, faces = read_mesh(path)
-    # Scale the mesh for repair, whose tolerances are for a solid of this size.
+    # Scale the mesh for repair, whose tolerances are for a solid of `NOMINAL_MM`.
     vertices = 1e3 * np.asarray(scale) * vertices
     extent = float(np.ptp(vertices, axis=0).max())
     if not 1e-9 < extent < np.inf:

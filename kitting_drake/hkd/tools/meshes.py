@@ -7,8 +7,10 @@ from manifold3d import Manifold
 
 
 def vertices_and_faces(solid: Manifold) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the vertices (n, 3) of a solid's surface, in the solid's units, and its faces (m,
-    3)."""
+    """Returns the vertices (n, 3) and the triangles (m, 3) of a solid's surface.
+
+    The vertices are in the solid's units.
+    """
     mesh = solid.to_mesh64()
     return np.asarray(mesh.vert_properties)[:, :3], np.asarray(mesh.tri_verts).astype(int)
 

@@ -87,7 +87,7 @@ def plane_of_scale(cv2: Any, photo: Photo, scale: Scale, camera_mm: float | None
 def _focal(photo: Photo, px_per_mm: float, camera_mm: float | None) -> tuple[float, str]:
     """Returns the focal length in pixels, and a note on its source."""
     if camera_mm is not None:
-        return px_per_mm * camera_mm, f"the camera {camera_mm:g} mm above, as given"
+        return px_per_mm * camera_mm, f"the camera is {camera_mm:g} mm above the ground, as given"
     equivalent = photo.focal_35mm or ASSUMED_FOCAL_35MM
     told = (
         "from the photo's EXIF data" if photo.focal_35mm else "assumed: the photo does not state it"
@@ -104,7 +104,7 @@ def _straight_down(
     width, height = photo.size
     homography = np.array([[px_per_mm, 0, -0.5], [0, -px_per_mm, height - 0.5], [0, 0, 1.0]])
     view = PlaneView(homography, focal, np.append(_center(photo, px_per_mm), focal / px_per_mm), 0)
-    notes = [*notes, "the photo is taken to be from straight above"]
+    notes = [*notes, "the photo is assumed to be taken from straight above"]
     hidden = () if hidden_px is None else (view.to_plane(hidden_px),)
     high = np.array([width, height]) / px_per_mm
     return GroundPlane(view, photo.pixels, np.zeros(2), high, None, hidden, notes)
@@ -220,7 +220,7 @@ def _by_board(cv2: Any, photo: Photo, scale: Scale, camera_mm: float | None) -> 
         )
     if camera_mm is not None:
         focal = focal_of_height(homography, camera_mm, focal, photo.center)
-        told = f"the camera {camera_mm:g} mm above, as given"
+        told = f"the camera is {camera_mm:g} mm above the ground, as given"
     view = view_of(homography, focal, photo.center)
     border = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * [columns * square, rows * square]
     outward = np.sign(border - border.mean(axis=0)) * _MARGIN_MM

@@ -166,7 +166,7 @@ def _focal(photo: Photo, homography: Array, camera_mm: float | None) -> tuple[fl
     if camera_mm is not None:
         start = photo.focal_px(ASSUMED_FOCAL_35MM)
         focal = focal_of_height(homography, camera_mm, start, photo.center)
-        return focal, f"the camera {camera_mm:g} mm above the sheet, as given"
+        return focal, f"the camera is {camera_mm:g} mm above the sheet, as given"
     if photo.focal_35mm:
         text = (
             f"focal length {photo.focal_35mm:g} mm (35 mm equivalent), from the photo's EXIF data"

@@ -298,13 +298,15 @@ def _corrected(
 
 def _view_notes(plane: GroundPlane, request: TraceRequest, count: int) -> list[str]:
     view = plane.view
-    where = f"camera {view.camera[2]:.0f} mm above, {math.degrees(view.tilt):.0f} degrees tilted"
+    where = (
+        f"the camera is {view.camera[2]:.0f} mm above the ground, tilted by "
+        f"{math.degrees(view.tilt):.0f} degrees"
+    )
     if not request.heights_mm:
         return [where, "not corrected for the tools' height: give --height_mm"]
-    at = {"upright": "from foot to top", "round": "at half the height"}[request.edges]
     if count > 1:
-        where += f"; {count} tools (shine across a tool may have split it)"
-    return [where, f"corrected for the tools' height, with the sides {at}"]
+        where += f"; {count} tools (a reflection across a tool may have split it)"
+    return [where, f"corrected for the height of the tools, whose sides are {request.edges}"]
 
 
 def _write(

@@ -78,7 +78,7 @@ def test_what_finds_no_room_is_said():
     sheet = fill_sheet((250.0, 200.0), 10.0, 5.0, kits, 3)
     counts = [sum(place.kit == index for place in sheet.places) for index in (0, 1)]
     assert counts == [3, 1]
-    assert sheet.notes[0] == "2 of 3 'large' find no room on the sheet"
+    assert sheet.notes[0] == "2 of 3 copies of 'large' find no room on the sheet"
     assert "different heights: 40 and 50 mm" in sheet.notes[1]
     with pytest.raises(UserError, match="'large' of 200 by 120 mm does not fit"):
         fill_sheet((210.0, 150.0), 10.0, 5.0, kits, None)

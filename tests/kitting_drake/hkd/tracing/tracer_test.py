@@ -203,7 +203,7 @@ def test_a_camera_height_overrules_the_focal_length(tmp_path: Path):
     given = plane_of_scale(cv2, photo, scale, 500.0)
     assert given.view.camera[2] == pytest.approx(500.0)
     assert not any("EXIF" in note for note in given.notes)
-    assert any("500 mm above, as given" in note for note in given.notes)
+    assert any("500 mm above the" in note for note in given.notes)
 
 
 def test_a_board_gives_the_scale_and_the_pose(tmp_path: Path):
