@@ -69,7 +69,7 @@ def test_a_part_has_one_link_in_contact_along_its_outline():
         ("ring_100x30x10", "a bore of 30 mm has no room for the finger"),
         ("plate_100x90x10", "the jaws hold 3 to 70 mm"),
         ("plate_50x20x2", "the hand needs at least 4 mm"),
-        ("ring_40x20", "give outer x inner x height"),
+        ("ring_40x20", "outer x inner x height in mm"),
         (f"rod_{LONGEST_MM + 1:g}x10", "must be 2 to 350 mm"),
     ],
 )
