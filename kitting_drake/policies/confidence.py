@@ -2,7 +2,7 @@
 
 The estimate is a logistic regression on facts about the decision: the networks' certainty, how well
 the outlines of object and recess fit, the room for the jaws, and how much is seen. `benchmark
-reliability` fits it to scenes with random cameras that no network was trained on. This is not in
+reliability` fits it to scenes with random cameras, on which no network was trained. This is not in
 the paper.
 """
 
@@ -29,12 +29,13 @@ if TYPE_CHECKING:
 FILE = MODELS / "policies" / "confidence.json"
 """The file of the fitted regressions, one for each kind of policy."""
 _SAME_PICK = 0.010
-"""Probability that the networks assign to pixels within this distance of the pick supports the
-pick, in metres."""
+"""The radius, in metres, around the pick within which predicted probability supports the pick."""
 _OTHER_PICKS = 0.060
-"""Probability within this distance of the pick is taken to belong to the same object, in metres."""
+"""The radius, in metres, around the pick within which predicted probability is taken to belong to
+the same object."""
 _SAME_ANGLE = math.radians(10)
-"""Probability within this angle of the chosen pick angle supports the angle, in radians."""
+"""The largest angle, in radians, from the chosen pick angle at which predicted probability supports
+the chosen angle."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,7 @@ class Reliability:
     """The least confidence at which the robot acts."""
 
     def confidence(self, evidence: Evidence) -> float:
-        """The estimated probability of success, from 0 to 1."""
+        """Returns the estimated probability of success, from 0 to 1."""
         total = self.weights[""]
         total += sum(self.weights[name] * value for name, value in evidence.items())
         return 1 / (1 + math.exp(-max(-30.0, min(total, 30.0))))
@@ -91,14 +92,14 @@ def evidence_of_networks(observation: Observation, decision: Decision) -> Eviden
 
 
 def certainty(decision: Decision, resolution: float) -> dict[str, float]:
-    """How certain the networks are of a decision, from the probabilities that they predict.
+    """Returns how certain the networks are of a decision, as numbers from 0 to 1:
 
-    - `something_to_pick`, or for a stop `nothing_to_pick`: the probability from the stop class of
-      the pick-position network alpha, if it has one;
-    - `pick`: of the probability that alpha assigns within 6 cm of the pick, the share within 1 cm.
-      Other objects that could be picked just as well do not lower it;
-    - `angle`: the probability that the pick-angle network beta assigns within 10 degrees of the
-      chosen angle.
+    - `something_to_pick` (for a stop, `nothing_to_pick`): the predicted probability that this is
+      so; missing if the networks have no stop class;
+    - `pick`: the probability of the pixels within 1 cm of the pick, divided by that of the pixels
+      within 6 cm, so that other objects do not lower it; missing for a stop;
+    - `angle`: the probability of the angles within 10 degrees of the chosen one; missing for a
+      stop.
     """
     parts: dict[str, float] = {}
     if decision.log_odds is not None:

@@ -59,7 +59,7 @@ def network_input(
 
 
 class Look:
-    """One observation, together with all results that are computed from it only once."""
+    """An observation, with cached results that several stages need."""
 
     def __init__(
         self,
@@ -179,10 +179,8 @@ class Draft:
         return best_placement(candidate, self.look.orientations, self.continuous)
 
     def among(self, mask: Mask) -> Draft | None:
-        """The draft of the best pick within a mask (rows, cols), after the same stages.
-
-        Returns None if the mask leaves no pixel to pick.
-        """
+        """Returns the best pick within a mask (rows, cols), refined by the same stages; None if the
+        mask leaves no pixel to pick."""
         left = _without(self.logits, ~mask)
         if not bool((left > _NEVER).any()):
             return None
@@ -229,7 +227,7 @@ def near_failed(grid: PixelGrid, failed_picks: Sequence[PlanarPose]) -> Mask:
 
 
 def expected_position(logits: Tensor, pixel: tuple[int, int]) -> Array:
-    """Sub-pixel refinement: the mean position under the softmax over a pixel and its neighbours.
+    """Returns the mean position under the softmax over a pixel and its neighbours.
 
     Networks trained with interpolated labels (see `losses`) predict this mean.
 
@@ -246,8 +244,10 @@ def expected_position(logits: Tensor, pixel: tuple[int, int]) -> Array:
 def best_placement(
     candidate: Candidate, orientations: int, continuous: bool
 ) -> tuple[float, Array]:
-    """The best rotation, in radians, and position (row, col) of a candidate, refined if
-    `continuous`."""
+    """Returns a candidate's best rotation, in radians, and best position (row, col).
+
+    If `continuous`, they are refined to less than a bin and less than a pixel.
+    """
     _, rotation, row, col = candidate.best()
     found = np.array([rotation, row, col], float)
     if continuous:
@@ -263,7 +263,7 @@ def _without(logits: Tensor, mask: Mask) -> Tensor:
 
 
 def _local_mean(logits: Tensor, index: tuple[int, int, int]) -> Array:
-    """The mean index, under the softmax over an entry and its neighbours."""
+    """Returns the mean index (3) under the softmax over the entry at `index` and its neighbours."""
     starts = [max(i - 1, 0) for i in index]
     part = logits[
         starts[0] : index[0] + 2, starts[1] : index[1] + 2, starts[2] : index[2] + 2

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 _LARGEST_RATIO = 3.0
-"""Largest allowed ratio, in either direction, between the sizes of pixels now and in training."""
+"""The largest allowed ratio of the sizes of pixels in use and in training, in either direction."""
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from kitting_drake.policies.stages import StopRule, SubPixel
 from systems.signals import LeftOver, Observation, PickPlaceAction, PlanarPose
 
 _ELSEWHERE = 8.0
-"""Places farther apart than this count as different, in pixels."""
+"""The distance, in pixels, beyond which two places count as different."""
 _MOST_MARGIN = 20.0
 """Upper limit of `Decision.place_margin`, in nats."""
 
@@ -32,14 +32,14 @@ class Decision:
 
     action: PickPlaceAction
     """The action. If its `stop` is set, its poses are those that the policy would have chosen
-    otherwise."""
+    without the stop."""
     pick_map: NDArray[np.float32]
     """(rows, cols): p(u, v), the picking module's probabilities."""
     angle_curve: NDArray[np.float32]
     """(n,): p(theta | u, v) at the angles pi i / n."""
     place_map: NDArray[np.float32]
-    """(rows, cols): the best score over all rotations, relative to the maximum, in nats, from a
-    coarse search."""
+    """(rows, cols): each pixel's best score over all rotations, minus the best score of all pixels,
+    in nats, as found by a coarse search."""
     pick_pixel: NDArray[np.float64]
     """(row, col) of the pick."""
     place_pixel: NDArray[np.float64]
@@ -62,7 +62,7 @@ class Decision:
 
     @property
     def stop(self) -> bool:
-        """Whether there is nothing left to pick."""
+        """Whether the policy stops."""
         return self.action.stop
 
 
@@ -172,21 +172,21 @@ def _decision(draft: Draft) -> Decision:
         belongs=draft.belongs,
         kit_seen=draft.look.segmentation.kit_seen if draft.outlined else None,
         place_margin=_place_margin(draft),
-        **_told(draft),
+        **_outline_fields(draft),
     )
 
 
 def _left_over(draft: Draft) -> LeftOver | None:
-    """The objects and recesses that a stopping policy still sees.
+    """Returns the objects and recesses that a stopping policy still sees.
 
     Returns None if the policy continues, or does not use outlines.
     """
     return draft.look.inventory.left_over if draft.stop and draft.outlined else None
 
 
-def _told(draft: Draft) -> dict[str, Any]:
-    """Fields of `Decision` that say how far the stages moved an action, and the geometric facts
-    about it."""
+def _outline_fields(draft: Draft) -> dict[str, Any]:
+    """Returns the fields `moved_pick`, `moved_place` and `geometry` of a `Decision`; empty if
+    outlines are not used."""
     if draft.stop or not draft.outlined:
         return {}
     millimetres = 1e3 * draft.look.resolution
@@ -206,8 +206,8 @@ def _told(draft: Draft) -> dict[str, Any]:
 
 
 def _place_margin(draft: Draft) -> float:
-    """The difference between the scores of the best place and of the best place more than
-    `_ELSEWHERE` away from it, in nats."""
+    """Returns, in nats, how much higher the best place scores than the best place farther than
+    `_ELSEWHERE` from it."""
     candidates = draft.placing.candidates
     best, _, row, col = candidates[0].best()
     others = [

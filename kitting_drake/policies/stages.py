@@ -24,14 +24,14 @@ from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import wrap_to_pi
 
 _AS_GOOD = 2.0
-"""Rotations whose score is within this of the best count as equally good, in nats, if their places
-are also close together."""
+"""A rotation counts as equally good as the best one if its score is at most this many nats lower
+and its place is within `_SAME_PLACE`."""
 _SAME_PLACE = 4.0
-"""Places at most this far apart count as close together, in pixels."""
+"""The largest distance, in pixels, between the places of rotations that count as equally good."""
 _TRIES = 4
 """The largest number of picks that are tried to find one that is seen well enough."""
 _ANOTHER = 0.010
-"""The next pick to try is at least this far from the last one, in metres."""
+"""The least distance, in metres, between a pick and the next one that is tried."""
 _NOTHING_FITS = 2.0
 """How much the stop threshold is raised if the outlines show nothing to pick, in nats.
 
@@ -48,7 +48,7 @@ def make_stages(
     recover: bool = False,
     may_stop: bool = True,
 ) -> tuple[Stage, ...]:
-    """The stages of a policy's decisions. The arguments are the fields of `!Learned` in a scenario.
+    """Returns the stages of a policy, in the order in which they are applied.
 
     Args:
         planner: parameters of the motion with which the hand will pick and place.
@@ -191,7 +191,7 @@ class ReleaseRoom:
 
 @dataclass(frozen=True)
 class BelongingFirst:
-    """Picks first the objects that fit into a recess (`Inventory.pairs`), then those that may
+    """Picks first the objects that fit into a recess (`Inventory.pairs`), then the regions that may
     contain such an object (`Inventory.worth_a_try`)."""
 
     def refine(self, draft: Draft) -> Draft:
@@ -255,8 +255,8 @@ class OutlineStop:
 
 @dataclass(frozen=True)
 class SeenOnly:
-    """Picks and places only where enough of o_t is seen (see `Visibility`). If there is no such
-    action, stops."""
+    """Picks and places only where enough of o_t is seen (see `Visibility`). Stops if there is no
+    such action."""
 
     planner: PickPlaceParameters
     outlines: bool = True
@@ -303,8 +303,8 @@ class Recovery:
     """Corrects failed insertions (`recovery_action`), takes heaps apart (`separating_action`), and
     turns objects over (`turning_action`).
 
-    It presses a protruding object down at once. The other corrections cost actions, so they come
-    only when no other object fits into a recess.
+    It presses a protruding object down at once. The other corrections take several actions, so they
+    come only when no object fits into a recess.
     """
 
     planner: PickPlaceParameters

@@ -19,14 +19,15 @@ from kitting_drake.policies.matching.registration import (
 from kitting_drake.policies.matching.segmentation import Region, Segmentation
 
 _WORST_COST = 0.0019
-"""An object fits into a recess if the mean difference of their outlines is at most this, in
-metres."""
-_GOOD, _CLEARLY_BETTER = 0.0005, 0.75
-"""An object counts as reversed if its mismatch with the recess exceeds the first number, in metres,
-and that of its mirror image is less than the second number times its own."""
+"""The largest mismatch, in metres, of an object and a recess into which it fits."""
+_GOOD = 0.0005
+"""An object whose mismatch with its recess is less than this, in metres, is not reversed."""
+_CLEARLY_BETTER = 0.75
+"""An object is reversed only if its mirror image's mismatch with the recess is less than this share
+of its own."""
 _PROMISING = 2.0
-"""An object's outline is registered to a recess only if the coarse cost is at most this multiple of
-the object's least coarse cost."""
+"""An object's outline is registered to a recess only if its `coarse_cost` there is at most this
+multiple of its least `coarse_cost` in any recess."""
 
 
 @dataclass(frozen=True)
@@ -44,8 +45,8 @@ class Pair:
 
 
 def match(segmentation: Segmentation, resolution: float) -> list[Pair]:
-    """Pairs of loose objects and recesses, best fit first. Each object and each recess occurs at
-    most once.
+    """Returns pairs of a loose object and the recess into which it fits, best fit first. Each
+    object and each recess occurs at most once.
 
     Args:
         segmentation: the segmentation of an observation.

@@ -17,9 +17,9 @@ Evidence = dict[str, float]
 """Named facts about a decision; the same names for all decisions of a policy."""
 
 _RING = 3
-"""The surroundings of an object extend this far from it, in pixels."""
+"""How far the surroundings of an object extend from it, in pixels."""
 _HOLE = 0.003
-"""A part of o_t is a hole if it is lower than its rim by more than this, in metres."""
+"""The least depth of a hole below its rim, in metres."""
 _WORST_FIT = 0.002
 _WORST_GRASP = 5.0
 

@@ -14,14 +14,16 @@ from kitting_drake.policies.matching.splitting import split_touching
 from systems.signals import Attempt, LeftOver, Observation, PlanarPose
 
 _THERE = 0.015
-"""An object within this distance of an earlier pick or place counts as the one that was moved, in
-metres.
-"""
+"""The radius, in metres, around an earlier pick or place within which an object counts as the one
+that was moved."""
 _MOST_TRIES = 3
 """An object is tried at most this many times."""
-_LEAST_SHARE, _LARGEST_SHARE = 0.5, 1.6
-"""A region may contain objects for the open recesses if its area is at least the first number times
-that of the smallest recess, and at most the second number times the area of all of them."""
+_LEAST_SHARE = 0.5
+"""The least area of a region that may contain an object for an open recess, as a share of the
+smallest open recess's area."""
+_LARGEST_SHARE = 1.6
+"""The largest area of a region that may contain objects for the open recesses, as a multiple of the
+total area of these recesses."""
 
 
 @dataclass(frozen=True)
@@ -73,8 +75,7 @@ class Inventory:
     def strangers(self) -> tuple[Region, ...]:
         """The objects that fit into no recess and were not tried too often, largest first.
 
-        Such a region may be several touching objects, or one object of which the usual outline is
-        not visible.
+        Such a region may be several touching objects, or one object whose outline is partly hidden.
         """
         paired = {pair.item for pair in self.pairs}
         objects = enumerate(self.segmentation.objects)
@@ -86,7 +87,7 @@ class Inventory:
 
     @property
     def worth_a_try(self) -> tuple[Region, ...]:
-        """The `strangers` whose size allows that they contain objects for the open recesses."""
+        """The `strangers` that, by their size, may contain objects for the open recesses."""
         areas = [int(item.mask.sum()) for item in self.open_recesses]
         if not areas:
             return ()
@@ -151,8 +152,8 @@ class Inventory:
         return sum(self._is_there(_left_at(attempt), region) for attempt in self._history)
 
     def was_removed(self, region: Region) -> bool:
-        """Whether an object was taken out from here earlier, and an object was placed here again
-        since."""
+        """Whether earlier actions first took an object out of this region, and then placed an
+        object here again."""
         removed = False
         for attempt in self._history:
             if attempt.outcome != "placed":

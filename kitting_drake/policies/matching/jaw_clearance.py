@@ -23,11 +23,11 @@ from systems.signals import PixelGrid, PlanarPose
 Array = NDArray[np.float64]
 
 RETRY_DISTANCE = 0.010
-"""A grasp is not retried within this distance of a failed one, in metres."""
+"""The radius, in metres, around a failed grasp within which no grasp is tried again."""
 _ANGLES = 36
 _MOST_PLACES = 80
 _REACH = 0.055
-"""Grasps are sought within this distance of the object's centre, in metres."""
+"""The radius, in metres, around the object's centre within which grasps are sought."""
 _STEP = 0.0015
 """The distance between samples across the jaws, in metres."""
 _LINES = 5
@@ -38,19 +38,20 @@ fingers can come down on either side."""
 _NARROWEST = 0.003
 """The least width of a grasp, in metres."""
 _LOWEST = 0.003
-"""Anything that rises by less than this above its support is not an obstacle, in metres."""
+"""The least clearance, in metres, of the fingertips above the object's support, and of the palm
+above everything."""
 _FINGER_MARGIN = 0.003
 """The clearance kept outside the fingers of the open jaws, in metres."""
 _STRAIGHT = 0.003
-"""A part of a face touches the pads if it is recessed by less than this, in metres."""
+"""A part of the object's face that is recessed by less than this, in metres, touches the pad."""
 
 
 @dataclass(frozen=True)
 class JawGrasp:
-    """A grasp that the jaws can take, in pixels of o_t."""
+    """A feasible grasp, in pixels of o_t."""
 
     pixel: Array
-    """(row, col), midway between the faces."""
+    """(row, col) midway between the gripped faces."""
     theta: float
     """The gripper's angle in radians; adding pi gives the same grasp."""
     cost: float
@@ -65,7 +66,7 @@ def failed_pixels(grid: PixelGrid, failed_picks: Sequence[PlanarPose]) -> Array:
 
 
 def untried(grasps: Sequence[JawGrasp], failed: Array, resolution: float) -> list[JawGrasp]:
-    """The grasps that are farther than `RETRY_DISTANCE` from every failed grasp.
+    """Returns the grasps that are farther than `RETRY_DISTANCE` from every failed grasp.
 
     Args:
         grasps: the grasps from which to choose.
@@ -89,7 +90,7 @@ def jaw_grasps(
     support: float = 0.0,
     balance: Array | None = None,
 ) -> list[JawGrasp]:
-    """The grasps of an object, best first; empty if there is none.
+    """Returns the feasible grasps of an object, best first.
 
     Args:
         segmentation: the segmentation of the observation.
@@ -127,7 +128,7 @@ def jaw_grasps(
 def _seen(
     grasps: list[JawGrasp], segmentation: Segmentation, planner: PickPlaceParameters
 ) -> list[JawGrasp]:
-    """The grasps whose surroundings are seen (`Visibility.picks_are_seen`)."""
+    """Returns the grasps whose surroundings are seen (`Visibility.picks_are_seen`)."""
     if not grasps:
         return grasps
     pixels = np.array([grasp.pixel for grasp in grasps])
@@ -137,14 +138,15 @@ def _seen(
 
 
 def tip_height(top: Array, support: float, planner: PickPlaceParameters) -> Array:
-    """The height of the fingertips above the table at a grasp, in metres.
+    """Returns the height of the fingertips above the table at a grasp, in metres.
 
-    It is that of `motion_heights`, but keeps a clearance to the object's support.
+    It is the grasp height of `motion_heights`, raised if needed to clear the object's support.
 
     Args:
         top: the height of the object's top, in metres above the table.
         support: the height of the object's support, in metres above the table.
-        planner: the depth of the fingertips and their clearance above the table.
+        planner: parameters that give the depth of the fingertips below the object's top and their
+            clearance above the table.
     """
     share = planner.grasp_depth_share * (top - support)
     depth = np.maximum(planner.grasp_depth, np.minimum(share, planner.max_grasp_depth))
@@ -160,7 +162,7 @@ def _grip(
     planner: PickPlaceParameters,
     support: float,
 ) -> list[JawGrasp]:
-    """The feasible grasps among positions (n, 2) and angles (n,)."""
+    """Returns those of n grasps, at positions (n, 2) and angles (n,), that are feasible."""
     raised = ndimage.maximum_filter(relief, 3)
     top = raised[tuple(np.rint(places).astype(int).T)].astype(float)
     tip = tip_height(top, support, planner)
@@ -233,8 +235,9 @@ def _straightness(
         right: (n,), the highest s within the object.
 
     Returns:
-        Three arrays (n,): the share of the lines that touch both pads, the sum of the slopes of
-        both faces along the pads, and the part of the slopes that both faces share.
+        (n,): the share of the lines that touch both pads.
+        (n,): the sum of the two faces' absolute slopes along the pads.
+        (n,): the absolute value of the sum of these two slopes.
     """
     low = np.where(inside.any(axis=2), s[inside.argmax(axis=2)], np.nan)
     high = np.where(inside.any(axis=2), s[len(s) - 1 - inside[:, :, ::-1].argmax(axis=2)], np.nan)

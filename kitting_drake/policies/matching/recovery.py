@@ -25,11 +25,11 @@ from systems.signals import Observation, PickPlaceAction, PlanarPose
 Array = NDArray[np.float64]
 
 _PRESSED = 0.012
-"""An object that protrudes by more than this is taken out rather than pressed, in metres."""
+"""An object that protrudes by more than this, in metres, is taken out rather than pressed down."""
 _TRIED = 0.020
-"""A press or grasp within this distance of an earlier one counts as the same, in metres."""
+"""Presses or grasps closer together than this, in metres, count as the same."""
 _NEARBY = 12
-"""The fixture's top beside an object is measured within this many pixels."""
+"""The height of the fixture's top is measured within this many pixels of an object."""
 _ROOM = 0.045
 """The least distance between an object laid down and everything else, in metres."""
 
@@ -96,7 +96,8 @@ def _take_out(
 
 
 def _free_place(segmentation: Segmentation, resolution: float) -> Array | None:
-    """The (row, col) farthest from everything else; None if there is not enough room."""
+    """Returns the (row, col) on the table farthest from everything that lies there; None if there
+    is not enough room."""
     # Mark the image's border as occupied, so that the object is laid inside the image.
     occupied = np.pad(segmentation.occupied, 1, constant_values=True)
     distance = ndimage.distance_transform_edt(~occupied)[1:-1, 1:-1]

@@ -2,9 +2,9 @@
 
 The place is refined by fitting the object's outline to the recess, and the grasp by the room for
 the jaws. The fit corrects errors of millimetres and degrees. It also decides between two rotations
-that differ by half a turn, although the outlines may differ only at the ends. If the outlines do
-not agree, for instance because the recess is hidden or there is none, the prediction stays as it
-is. This is not in the paper.
+that differ by half a turn, even for an object whose two ends differ little. If the outlines do not
+agree, for instance because the recess is hidden or there is none, the prediction stays as it is.
+This is not in the paper.
 """
 
 from __future__ import annotations
@@ -36,16 +36,16 @@ from systems.signals import wrap_to_pi
 Array = NDArray[np.float64]
 
 _WORST_COST = 0.0016
-"""A fit with a larger mean difference of the outlines is rejected, in metres."""
+"""The largest mean difference of the outlines, in metres, in an accepted fit."""
 _HALF_TURN_GAIN = 0.00005
-"""The rotation by another half turn is chosen if its `preference` is larger than this, in
+"""Another fit replaces the fit at the predicted rotation if its `preference` exceeds this, in
 metres."""
 _RIVAL_GAIN = 0.85
 """Another recess is chosen if its mismatch is less than this share of the predicted recess's
 mismatch."""
 _PROMISING = 1.2
-"""The object's outline is registered to another recess only if the coarse cost is at most this
-multiple of that of the predicted recess."""
+"""The object's outline is registered to another recess only if its `coarse_cost` there is at most
+this multiple of its `coarse_cost` in the predicted recess."""
 _LARGEST_SHIFT = 0.010
 """The largest correction of the object's centre, in metres."""
 _LARGEST_ROTATION = math.radians(10)
@@ -54,16 +54,18 @@ _LEVER = 0.03
 """When grasps are compared, a rotation of the jaws by one radian weighs as much as this distance,
 in metres."""
 _FARTHEST_GRASP = 0.04
-"""A refined grasp is at most this far from the predicted one, in metres."""
+"""The largest distance, in metres, of a refined grasp from the predicted one."""
 _POOR = 0.03
 """When grasps are compared, a grasp cost of one weighs as much as this distance, in metres."""
 _MUCH_WORSE = 0.5
-"""A predicted grasp is replaced only if its cost is higher by more than this; see
-`JawGrasp.cost`."""
-_SAME_PLACE, _SAME_ANGLE = 0.008, math.radians(8)
-"""Grasps closer than this, in metres and radians, count as the same."""
+"""A predicted grasp is replaced only if its `JawGrasp.cost` exceeds that of the best grasp nearby
+by at least this."""
+_SAME_PLACE = 0.008
+"""The distance, in metres, below which two grasps with similar angles count as the same."""
+_SAME_ANGLE = math.radians(8)
+"""The angle, in radians, below which two grasps at similar places count as the same."""
 _NEAR = 6.0
-"""A position within this distance of a region belongs to it, in pixels."""
+"""The largest distance, in pixels, of a position from a region to which it belongs."""
 
 
 @dataclass(frozen=True)
@@ -94,8 +96,8 @@ def refine_place(
         rotation: predicted rotation of the object, in radians.
         place: (row, col) predicted for the object's point under the pick.
         resolution: the side of a pixel, in metres.
-        pairs: the result of `match`. The fit of such a pair is used if it is better than the fit
-            that starts at the prediction.
+        pairs: the result of `match`. If it pairs the object with the predicted recess, the fit of
+            this pair is used where it is better than the fit that starts at the prediction.
     """
     taken = nearest_region(segmentation.objects, pick)
     if taken is None:
@@ -109,8 +111,8 @@ def refine_place(
     target = trace_outline(recess.mask, resolution)
 
     def fit(angle: float, middle: Array) -> Registration | None:
-        """The fit that starts with the object's centre at `middle`; None if it ends too far
-        away."""
+        """Returns the fit that starts at rotation `angle` with the object's centre at `middle`;
+        None if it ends too far from this start."""
         start = (angle, middle - rotation_matrix(angle) @ outline.middle)
         found = register(outline, target, starts=(start,))
         away = np.linalg.norm(found.moved(outline.middle) - middle) * resolution
@@ -151,8 +153,8 @@ def _better_elsewhere(
     others: list[Region],
     resolution: float,
 ) -> Registration | None:
-    """The fit to another recess, if it is clearly better than the fit to the predicted recess; else
-    None.
+    """Returns the fit to another recess, if it is clearly better than the fit to the predicted
+    recess; else None.
 
     Args:
         taken: the object.
@@ -160,7 +162,7 @@ def _better_elsewhere(
         recess: the predicted recess.
         target: the outline of the predicted recess.
         fit: the registration of `outline` to `target`.
-        others: the other recesses.
+        others: the recesses other than the predicted one.
         resolution: the side of a pixel, in metres.
     """
     best, least = None, _RIVAL_GAIN * mismatch(fit, taken, recess)
@@ -177,7 +179,7 @@ def _better_elsewhere(
 
 
 def nearest_region(regions: tuple[Region, ...], pixel: Array) -> Region | None:
-    """The region nearest to a position (row, col); None if all are farther than `_NEAR`."""
+    """Returns the region nearest to a position (row, col); None if all are farther than `_NEAR`."""
     best, least = None, _NEAR
     for region in regions:
         distance = float(np.linalg.norm(region.pixels - pixel, axis=1).min())
@@ -220,17 +222,16 @@ def refine_grasp(
         resolution: the side of a pixel, in metres.
         planner: parameters of the motion with which the hand will pick.
         failed: (n, 2) row and column of each failed grasp; they are avoided.
-        balance: (row, col) of the object's centre of mass, if the hand has measured it. The grasp
-            with the least cost with respect to it is then chosen, at any distance from the
-            predicted one.
+        balance: (row, col) of the object's centre of mass, if the hand has measured it. Then the
+            grasp with the least cost is chosen, however far it is from the predicted one.
     """
     taken = nearest_region(segmentation.objects, pick)
     if taken is None:
         return None
 
     def away(grasp: JawGrasp) -> tuple[float, float]:
-        """The distance of a grasp from the predicted one, in metres, and the angle between them, in
-        radians."""
+        """Returns the distance of a grasp from the predicted one, in metres, and the angle between
+        the two grasps, in radians."""
         distance = float(np.linalg.norm(grasp.pixel - pick)) * resolution
         return distance, abs(math.remainder(grasp.theta - theta, math.pi))
 

@@ -1,10 +1,10 @@
 """Registers an object's outline to that of a recess, to less than a pixel.
 
-Both outlines are signed distances on a grid that is finer than that of o_t. The outline of a recess
-is that of its object, with narrow notches closed, enlarged by a clearance (see
-`kitting_drake.hkd.kits.layout`). The notches of the object's outline are therefore closed first.
-The remaining offset between the outlines is fitted. It is the clearance plus about half a pixel,
-because a view from above makes objects wider and recesses narrower.
+Each outline is stored as signed distances on a grid that is finer than that of o_t. A recess has
+the outline of its object, but without narrow notches, and wider by a clearance (see
+`kitting_drake.hkd.kits.layout`). So narrow notches of the object's outline are closed first. The
+outlines then differ by a constant offset, which is fitted as well. It is the clearance plus about
+half a pixel, because a view from above makes objects wider and recesses narrower.
 
 At points near the object's outline, the signed distances from the two outlines are compared. The
 cost is the mean of a robust function of their differences. Gauss-Newton minimizes it over
@@ -28,23 +28,23 @@ Array = NDArray[np.float64]
 _SUBSAMPLING = 3
 """Number of fine pixels per pixel of o_t, along each axis."""
 _CLOSING_RADIUS = 0.008
-"""Notches of an object that are narrower than twice this are missing in its recess, in metres."""
+"""Half the width, in metres, below which a notch of an object is missing in its recess."""
 _BAND = 0.006
-"""The cost is computed at points within this distance of the object's outline, in metres."""
+"""The largest distance, in metres, from the object's outline of points at which the cost is
+computed."""
 _FARTHEST = 0.012
-"""Signed distances are clipped to plus or minus this, in metres."""
+"""Signed distances are clipped to plus or minus this many metres."""
 _ROBUST = 0.002
-"""Residuals larger than this, in metres, add no more to the cost than one of this size: they come
-from hidden or touching parts.
-"""
+"""In the cost, residuals larger than this, in metres, count as this much. Larger ones come from
+hidden or touching parts."""
 _WORST_REVERSE = 0.0025
-"""The largest mean distance of a recess's outline from the object's at which they match, in
-metres."""
+"""The largest mean distance, in metres, of a recess's outline from the outline of an object that
+fills the recess."""
 _LARGEST_OFFSET = 0.004
-"""The offset of the outlines is clipped to plus or minus this, in metres."""
+"""The offset of the outlines is clipped to plus or minus this many metres."""
 _OFFSET_WITHIN = 0.0025
-"""The limit of the offset for an outline of several objects, in metres. A larger offset could hide
-a wrong pose."""
+"""When one object is sought within the outline of several, the offset is clipped to plus or minus
+this many metres. A larger offset could hide a wrong pose."""
 _HEIGHT_WEIGHT = 0.1
 """The weight, in a mismatch, of the difference between the object's height and the recess's
 depth."""
@@ -72,7 +72,8 @@ class Outline:
     """(p,): the signed distances at `points`."""
 
     def sample(self, field: NDArray[np.float32], positions: Array, outside: float) -> Array:
-        """(n,): values of `distance` or of a `gradient` at positions (n, 2) in pixels of o_t."""
+        """Returns the values (n,) of `distance` or of a `gradient` at positions (n, 2) in pixels of
+        o_t. Off the grid the value is `outside`."""
         fine = ((positions - self.origin) * _SUBSAMPLING).T
         return ndimage.map_coordinates(field, fine, order=1, mode="constant", cval=outside)
 
@@ -89,11 +90,11 @@ class Registration:
     cost: float
     """The mean robust difference of the outlines, in metres."""
     offset: float = 0.0
-    """How much larger the signed distance from the recess's outline is than that from the object's,
-    in metres."""
+    """The signed distance of a point from the recess's outline minus that from the object's, in
+    metres."""
 
     def moved(self, pixel: Array) -> Array:
-        """The new position of a point (row, col) of the object."""
+        """Returns the new position of a point (row, col) of the object."""
         return rotation_matrix(self.rotation) @ pixel + self.shift
 
 
@@ -169,14 +170,15 @@ def register(
 
 
 def coarse_cost(outline: Outline, recess: Outline) -> float:
-    """A quick estimate of the cost of `register`, in metres."""
+    """Returns a quick estimate of the cost of the best fit that `register` would find, in
+    metres."""
     return float(_coarse(outline, recess)[0].min())
 
 
 def preference(
     outline: Outline, recess: Outline, first: Registration, second: Registration
 ) -> float:
-    """How much better the first fit is than the second where the two differ, in metres.
+    """Returns how much better the first fit is than the second, where they differ, in metres.
 
     If an object is rotated by half a turn, most points of its outline coincide with others, and the
     mean costs of the two fits differ only by noise. So each point is weighted by the difference of
@@ -211,10 +213,8 @@ def _brought(outline: Outline, recess: Outline, fit: Registration) -> tuple[Arra
 
 
 def residuals(outline: Outline, recess: Outline, fit: Registration) -> Array:
-    """(p,): the differences of the outlines' signed distances at the fitted points, in metres.
-
-    The fit's offset is subtracted.
-    """
+    """Returns the differences (p,) of the outlines' signed distances at the fitted points, minus
+    the fit's offset, in metres."""
     positions = outline.points @ rotation_matrix(fit.rotation).T + fit.shift
     return recess.sample(recess.distance, positions, _FARTHEST) - outline.values - fit.offset
 
@@ -233,12 +233,13 @@ def is_covered(outline: Outline, recess: Outline, fit: Registration) -> bool:
 
 
 def mismatch(fit: Registration, item: Region, recess: Region) -> float:
-    """How poorly an object and a recess agree in outline and height, in metres."""
+    """Returns how much an object and a recess differ in outline and height, in metres."""
     return fit.cost + _HEIGHT_WEIGHT * abs(item.height - recess.height)
 
 
 def _coarse(outline: Outline, recess: Outline) -> tuple[Array, Array]:
-    """The costs of evenly spaced rotations about the centroids, and these rotations in radians."""
+    """Returns the costs of evenly spaced rotations about the centroids, in metres, and these
+    rotations in radians."""
     step = max(1, len(outline.points) // _COARSE_POINTS)
     offsets = outline.points[::step] - outline.middle
     angles = np.arange(_ROTATIONS) * math.tau / _ROTATIONS

@@ -1,4 +1,4 @@
-"""Measures the fingers' room at the place in o_t.
+"""Measures in o_t how much room the fingers have at the place.
 
 A symmetric object such as a cube can be placed in several rotations. The networks cannot choose
 among them, because their features do not encode how the jaws hold the object. The choice matters if
@@ -24,14 +24,17 @@ _STEP = 0.001
 """The distance between samples along the jaws' path, in metres."""
 _LINES = 7
 """The number of sampled lines along the fingers' length."""
-_SUPPORT_REACH, _SUPPORT_SHARE = 0.06, 10.0
-"""The height of the object's support is estimated from the heights within the first number, in
-metres, as the percentile given by the second."""
+_SUPPORT_REACH = 0.06
+"""Half the side, in metres, of the square around the pick in which the height of the object's
+support is estimated."""
+_SUPPORT_PERCENTILE = 10.0
+"""The percentile of the heights around the pick that is taken as the height of the object's
+support."""
 _UNDER = 0.009
-"""The height of the support at the place is that of the highest point within this distance, in
-metres."""
+"""Half the side, in metres, of the square around the place whose highest point is taken as the
+height of the support there."""
 _LEAST = 0.004
-"""Anything that rises by less than this above the fingertips is not an obstacle, in metres."""
+"""The least height of an obstacle above the fingertips, in metres."""
 
 
 def blocked_at_place(
@@ -43,7 +46,7 @@ def blocked_at_place(
     place: Array,
     planner: PickPlaceParameters,
 ) -> float:
-    """The blocked share of the space that the fingers need at the place.
+    """Returns the blocked share, from 0 to 1, of the space that the fingers need at the place.
 
     Args:
         height: (rows, cols) heights of o_t, in metres.
@@ -56,7 +59,7 @@ def blocked_at_place(
     """
     top = _highest(height, pick, resolution, resolution)
     around = _window(height, pick, _SUPPORT_REACH / resolution)
-    support = float(np.percentile(around, _SUPPORT_SHARE))
+    support = float(np.percentile(around, _SUPPORT_PERCENTILE))
     tip = float(tip_height(np.array(top), support, planner))
     across = np.array([-math.sin(theta), math.cos(theta)])
     ways = np.arange(0.0, planner.open_width / 2, _STEP)
@@ -77,12 +80,13 @@ def blocked_at_place(
 
 
 def _sample(height: NDArray[np.float32], positions: Array) -> Array:
-    """(n,): the heights at positions (n, 2) in pixels; zero outside the image."""
+    """Returns the heights (n,) at positions (n, 2) in pixels; zero outside the image."""
     return ndimage.map_coordinates(height, positions.T, order=1, mode="constant", cval=0.0)
 
 
 def _window(height: NDArray[np.float32], pixel: Array, reach: float) -> NDArray[np.float32]:
-    """The heights within `reach` rows and columns of a pixel, which is clipped to the image."""
+    """Returns the heights within `reach` rows and columns of a pixel. A pixel outside the image is
+    first moved to its edge."""
     size = np.array(height.shape)
     middle = np.clip(np.rint(pixel), 0, size - 1)
     (top, left), (bottom, right) = (

@@ -25,24 +25,25 @@ Plane = NDArray[np.float64]
 _Fixture = tuple[Mask, Plane]
 """The convex hull of a fixture (rows, cols), and the plane of its top."""
 
-_MOST_FIXTURES, _COMPARABLE = 4, 0.3
-"""The largest number of fixtures, and the least area of a further fixture as a share of the largest
-one's."""
+_MOST_FIXTURES = 4
+"""The largest number of fixtures."""
+_COMPARABLE = 0.3
+"""The least area of a further fixture, as a share of the largest fixture's area."""
 _PLANE_BAND = 0.004
-"""Pixels within this distance of a plane belong to it, in metres."""
+"""The largest distance, in metres, from a plane at which a pixel belongs to it."""
 _LEAST_FIXTURE_HEIGHT = 0.015
 """The least height of a fixture above the table, in metres."""
 _LEAST_FIXTURE_AREA = 0.003
 """The least area of a fixture, in square metres. It is reduced for small pixels (see
 `_AreaLimits`)."""
 _OBJECT_HEIGHT = 0.003
-"""Anything that rises by more than this above the table is an object, in metres."""
+"""The least height of an object above the table, in metres."""
 _RECESS_DEPTH = 0.003
-"""Anything deeper than this below the fixture's top is a recess, in metres."""
+"""The least depth of a recess below the fixture's top, in metres."""
 _PROTRUSION = 0.002
-"""An object that rises by more than this above the fixture is not seated, in metres."""
+"""The largest height, in metres, by which a seated object rises above the fixture."""
 _LEAST_AREA = 0.0004
-"""Regions with less area than this are ignored as noise, in square metres. It is reduced for small
+"""The least area of a region, in square metres. Smaller regions are noise. It is reduced for small
 pixels."""
 _LEAST_CLEAN_AREA = 0.00008
 """The least area of an object on a table without noise, in square metres."""
@@ -50,36 +51,44 @@ _LEAST_PROTRUDING = 0.00012
 """The least area of a protruding object, in square metres. It is small, because an object may
 protrude only at one end."""
 _USUAL_PIXEL = 0.003125
-"""The side of the pixels, in metres, for which the least areas are chosen. Regions caused by noise
-have a certain number of pixels, so for smaller pixels the least areas are reduced."""
+"""The side of the pixels, in metres, for which the least areas are chosen. Noise affects a few
+pixels of any size, so the least areas are reduced for smaller pixels."""
 _CLOSING = 0.0094
-"""Gaps in a plateau are closed if they are at most twice this wide, in metres."""
+"""Half the width, in metres, of the widest gap in a plateau that is closed."""
 _FIXTURE_MARGIN = 0.006
-"""Pixels closer to the fixture's outline than this are neither table nor recess, in metres."""
+"""Nothing is an object within this distance, in metres, outside the fixture's outline, and nothing
+is a recess within half this distance inside it."""
 _CLEAN = 0.0005
-"""Heights whose noise has a smaller standard deviation than this are not filtered, in metres."""
+"""The largest standard deviation of the noise, in metres, at which heights are not filtered."""
 _CLEARLY = 2.0
-"""A height that differs by more standard deviations than this is not noise.
+"""A height is not noise if it differs from a plane by more standard deviations than this.
 
-The few noisy pixels that exceed it are isolated. A larger value would cut off the flat ends of an
-object. These ends show which of two headings, half a turn apart, the object has.
+The few noisy pixels that differ by more are isolated. A larger value would cut off the flat ends of
+an object, which are needed to tell its heading from the opposite one.
 """
-_OBJECT_SEEN, _RECESS_SEEN = 0.5, 0.3
-"""The least shares of an object's pixels, and of a free recess's pixels, that must be seen."""
-_GAP, _LEAST_GAP = 1.5, 0.003
-"""Half the width of the gap between an object and its recess is less than this: the first number in
-pixels, or the second in metres if that is more."""
-_FLAT, _FLAT_SHARE = 0.0006, 0.7
-"""A recess is free if its floor is flat: more than the share `_FLAT_SHARE` of the floor is within
-`_FLAT`, in metres, of one height. If twice the noise is more than `_FLAT`, it is used instead."""
+_OBJECT_SEEN = 0.5
+"""The least share of an object's pixels that must be seen."""
+_RECESS_SEEN = 0.3
+"""The least share of a free recess's pixels that must be seen."""
+_GAP = 1.5
+"""Half the largest width, in pixels, of the gap between an object and its recess."""
+_LEAST_GAP = 0.003
+"""Half the largest width, in metres, of the gap between an object and its recess, where this is
+more than `_GAP` pixels."""
+_FLAT = 0.0006
+"""The largest deviation, in metres, from a flat floor's median depth. If twice the noise is more,
+it is used instead."""
+_FLAT_SHARE = 0.7
+"""The share of a flat floor that deviates by at most `_FLAT` is larger than this."""
 _BELOW_TOP = 0.001
-"""Surfaces deeper than this are below the fixture's top, in metres."""
+"""The least depth, in metres, of a surface that counts as below the fixture's top."""
 _NOISY = 0.001
-"""If the noise has a larger standard deviation than this, a floor cannot be distinguished from an
-object, in metres."""
-_LEVEL, _TILT_ROUNDS = math.tan(math.radians(0.7)), 3
-"""A plateau counts as level if its slope is smaller than the first number. A steeper one is
-extended along its slope in as many rounds as the second number."""
+"""The standard deviation of the noise, in metres, above which an object in a recess cannot be
+distinguished from the recess's floor."""
+_LEVEL = math.tan(math.radians(0.7))
+"""The slope below which a plateau counts as level."""
+_TILT_ROUNDS = 3
+"""The number of rounds in which a tilted plateau is extended along its slope."""
 _NEIGHBOURS = np.ones((3, 3), bool)
 _CROSS = ndimage.generate_binary_structure(2, 1)
 
@@ -95,8 +104,8 @@ class _AreaLimits:
 
     @classmethod
     def of(cls, resolution: float, noise: float = math.inf) -> _AreaLimits:
-        """The limits for a side of the pixels and a standard deviation of the noise, both in
-        metres."""
+        """Returns the limits for pixels with the side `resolution` and heights with the standard
+        deviation `noise`, both in metres."""
         scale = min(1.0, (resolution / _USUAL_PIXEL) ** 2)
         least = scale * _LEAST_AREA
         clean = noise <= _CLEAN
@@ -135,9 +144,8 @@ class Segmentation:
     recesses: tuple[Region, ...]
     """Regions below the fixture's top, including the visible fragments of filled recesses."""
     protruding: tuple[Region, ...]
-    """The objects that protrude from the fixture, highest first. Their `height` is that above the
-    fixture's top.
-    """
+    """The objects that protrude from the fixture, highest first. Their `height` is measured from
+    the fixture's top."""
     relief: NDArray[np.float32]
     """(rows, cols): height above the table plane in metres; unseen pixels are filled in."""
     depth: NDArray[np.float32]
@@ -155,10 +163,11 @@ class Segmentation:
 
     @property
     def free_recesses(self) -> tuple[Region, ...]:
-        """The recesses that are seen and have a flat floor.
+        """The recesses that contain no object.
 
-        Other recesses contain an object: the gaps around it are narrow, the object itself is not
-        flat, or some of it ends just below the fixture's top.
+        They are wide, are seen, and have a flat floor. In a filled recess either only the narrow
+        gaps around the object are deep enough to be seen, or the object's surface is not flat, or
+        most of it ends just below the fixture's top.
         """
         return tuple(
             item
@@ -168,10 +177,10 @@ class Segmentation:
 
     @property
     def unfilled_recesses(self) -> tuple[Region, ...]:
-        """The recesses into which an object might fit: all but those that clearly contain one.
+        """The recesses into which an object might fit.
 
-        These are the `free_recesses` and narrow ones. If there is noise, they are all recesses,
-        because an object in a recess may then look like its floor.
+        These are the `free_recesses` and the narrow recesses. If there is noise, they are all
+        recesses, because an object in a recess may then look like the recess's floor.
         """
         if self.noise > _CLEAN:
             return self.recesses
@@ -207,10 +216,10 @@ class Segmentation:
         return np.asarray(ndimage.label(self.depth > _BELOW_TOP, _NEIGHBOURS)[0])
 
     def _is_fragment(self, recess: Region) -> bool:
-        """Whether a recess is only the visible fragment of a filled one.
+        """Whether a region is only a fragment of a filled recess.
 
-        Most of the recess then has an object's top just below the fixture's. Thin slots whose floor
-        no camera sees look alike, but are smaller than the rest of their recess.
+        An object's top, just below the fixture's top, then covers most of the recess. A slot whose
+        floor no camera sees looks similar, but covers the smaller part of its recess.
         """
         if self.noise > _CLEAN:
             return False
@@ -304,17 +313,17 @@ def _is_corner(item: Region, fixture: Mask, top: float, resolution: float) -> bo
 
 
 def _inner_radius(mask: Mask) -> float:
-    """The largest distance of a pixel of a mask from its edge, in pixels."""
+    """Returns the largest distance, in pixels, from a pixel of a mask to the mask's edge."""
     return float(ndimage.distance_transform_edt(np.pad(mask, 1)).max())
 
 
 def _noise_of(
     height: NDArray[np.float32], relief: NDArray[np.float32], fixtures: list[_Fixture]
 ) -> float:
-    """The largest standard deviation of the noise of the table and of the fixtures' tops, in
-    metres.
+    """Returns the largest of the standard deviations of the noise of the table and of each
+    fixture's top, in metres.
 
-    The table's noise can be underestimated, because heights below the grid are clipped.
+    The table's alone may be too small, because heights below the grid are clipped.
     """
     tops = [
         _noise((height - _plane_heights(plane, height.shape))[mask]) for mask, plane in fixtures
@@ -323,8 +332,8 @@ def _noise_of(
 
 
 def _noise(relief: NDArray[np.floating]) -> float:
-    """A robust standard deviation of heights relative to a plane to which most of them belong, in
-    metres."""
+    """Returns a robust estimate of the standard deviation of heights, in metres, from their
+    distances to a plane on which most of them lie."""
     flat = np.abs(relief[np.abs(relief) < 3 * _PLANE_BAND])
     return 1.4826 * float(np.median(flat)) if flat.size else 0.0
 
@@ -334,7 +343,8 @@ def _plane_heights(plane: Plane, shape: tuple[int, ...]) -> NDArray[np.float64]:
 
 
 def _fit_plane(height: NDArray[np.float32], start: float, where: Mask) -> Plane:
-    """A plane through most pixels of a mask, by three rounds of least squares on inliers."""
+    """Fits a plane to most pixels of the mask `where`, by three rounds of least squares on inliers.
+    The first round starts from a level plane at the height `start`, in metres."""
     plane = np.array([0.0, 0.0, start])
     rows, cols = np.nonzero(where)
     design = np.column_stack([rows, cols, np.ones(len(rows))])
@@ -348,7 +358,7 @@ def _fit_plane(height: NDArray[np.float32], start: float, where: Mask) -> Plane:
 
 
 def _mode(values: NDArray[np.float32]) -> float:
-    """The most frequent height, in metres."""
+    """Returns the most frequent height, in metres."""
     width = 0.001
     low = float(values.min())
     counts = np.bincount(((values - low) / width).astype(int))
@@ -385,8 +395,10 @@ def _find_fixtures(
 
 
 def _has_recess(fixture: Mask, depth: NDArray[np.float64], resolution: float) -> bool:
-    """Whether a fixture encloses a recess on all sides. A low part within the convex hull of a tool
-    is open to a side."""
+    """Whether a fixture encloses a recess on all sides.
+
+    A low area within the convex hull of a tool is no recess: it is open on a side.
+    """
     labels, count = ndimage.label(fixture & (depth > _RECESS_DEPTH), _NEIGHBOURS)
     sizes = np.bincount(labels.ravel(), minlength=count + 1)
     rim = fixture & ~ndimage.binary_erosion(fixture, iterations=2)
@@ -429,8 +441,8 @@ def _find_fixture(
 
 
 def _along_tilt(plateau: Mask, height: NDArray[np.float32], high: Mask, resolution: float) -> Mask:
-    """Extends a plateau that was found as a level band to the whole of a tilted plateau. Returns a
-    level plateau unchanged."""
+    """Extends a level band of a tilted plateau to the whole plateau. Returns a level plateau
+    unchanged."""
     for _ in range(_TILT_ROUNDS):
         plane = _fit_plane(height, float(np.median(height[plateau])), plateau)
         if math.hypot(plane[0], plane[1]) < _LEVEL * resolution:
@@ -456,7 +468,7 @@ def _regions(
     least: float,
     core: Mask | None = None,
 ) -> tuple[Region, ...]:
-    """The connected regions of a mask with enough area, largest first.
+    """Returns the connected regions of a mask that have enough area, largest first.
 
     Args:
         mask: (rows, cols) pixels that belong to regions.

@@ -27,14 +27,15 @@ from systems.signals import PickPlaceAction, PixelGrid, PlanarPose
 Array = NDArray[np.float64]
 
 _LAYERS = (0.008, 0.014, 0.022, math.inf)
-"""Depths below the highest point down to which a part counts as the topmost object, in metres. They
-are tried in this order."""
+"""Depths of the topmost object below a heap's highest point, in metres, in the order in which they
+are tried."""
 _LEAST_LAYER = 12
-"""A layer with fewer pixels than this is not an object."""
+"""The least number of pixels of a layer that may be an object."""
 _REACH = 0.030
-"""An object extends this far beyond its topmost layer, in metres."""
+"""The largest distance, in metres, by which an object extends beyond its topmost layer."""
 _ROOMS = (0.030, 0.015, 0.008)
-"""Clearances around an object at its free place, in metres. They are tried in this order."""
+"""Clearances around an object at its free place, in metres, in the order in which they are
+tried."""
 _TURNS = 12
 """The number of rotations that are tried for an object that is laid down."""
 _GRASPS = 6
@@ -75,7 +76,7 @@ def separating_action(
 def turning_action(
     inventory: Inventory, planner: PickPlaceParameters, failed_picks: Sequence[PlanarPose] = ()
 ) -> PickPlaceAction | None:
-    """Releases an object that lies upside down so that it tips over the edge of a block.
+    """Turns over an object that lies upside down, by releasing it at the edge of a block.
 
     Args:
         inventory: the objects and recesses of the observation.
@@ -83,7 +84,8 @@ def turning_action(
         failed_picks: gripper poses at which a grasp failed before; they are avoided.
 
     Returns:
-        The action; None if no object lies upside down, or none has a grasp and a free edge.
+        The action for the first such object that has both a feasible grasp and a free edge to tip
+            over; None if there is none.
     """
     segmentation, grid = inventory.segmentation, inventory.observation.grid
     failed = failed_pixels(grid, failed_picks)
@@ -117,7 +119,7 @@ def turning_action(
 
 
 def _ledges(segmentation: Segmentation, grid: PixelGrid) -> list[Ledge]:
-    """The blocks over whose edges objects can be turned: the smallest rectangle around each
+    """Returns the blocks over whose edges objects can tip: the smallest rectangle around each
     fixture."""
     labels, count = ndimage.label(segmentation.fixture)
     found = []
@@ -141,7 +143,8 @@ def _ledges(segmentation: Segmentation, grid: PixelGrid) -> list[Ledge]:
 
 
 def _layers(segmentation: Segmentation, region: Region) -> list[Region]:
-    """The topmost layers of a region, thinnest first. The last one is the whole region."""
+    """Returns the topmost layers of a region, thinnest first. The last layer is the whole
+    region."""
     relief = segmentation.relief
     top = float(np.percentile(relief[region.mask], 99))
     layers = []
@@ -159,10 +162,11 @@ def _layers(segmentation: Segmentation, region: Region) -> list[Region]:
 def _free_pose(
     segmentation: Segmentation, region: Region, layer: Region, pick: Array, resolution: float
 ) -> tuple[Array, float] | None:
-    """Finds a free pose for an object. Returns the place (row, col) of the gripped point and the
-    rotation in radians; None if there is no room.
+    """Finds the nearest of the free poses with the most room for an object.
 
-    Of the places with the most room, it is the nearest.
+    Returns:
+        The place (row, col) of the gripped point and the object's rotation in radians; None if
+            there is no room.
     """
     within = ndimage.distance_transform_edt(~layer.mask) * resolution < _REACH
     footprint = np.argwhere(region.mask & within) - pick
@@ -186,8 +190,8 @@ def _free_pose(
 
 
 def _free_pixels(free: NDArray[np.bool_], footprint: Array) -> Array | None:
-    """(n, 2): the positions at which all pixels of a footprint (m, 2) are free; None if there are
-    none."""
+    """Returns the positions (n, 2) at which all pixels of a footprint (m, 2) are free; None if
+    there are none."""
     cells = np.unique(np.rint(footprint).astype(int), axis=0)
     low, high = cells.min(axis=0), cells.max(axis=0)
     kernel = np.zeros(high - low + 1)

@@ -80,7 +80,7 @@ class ShapeMatchingPolicy:
     def _insert(
         self, inventory: Inventory, failed_picks: Sequence[PlanarPose]
     ) -> tuple[Matched | None, str]:
-        """The best insertion, or None and the reason for which there is none."""
+        """Returns the best insertion and an empty string, or None and the reason."""
         observation, segmentation = inventory.observation, inventory.segmentation
         failed = failed_pixels(observation.grid, failed_picks)
         resolution = observation.grid.resolution

@@ -31,29 +31,36 @@ Array = NDArray[np.float64]
 
 _ANGLES = 72
 _STARTS = 5
-"""Number of initial poses that are refined for each recess."""
-_OUTSIDE, _NOTCH, _RIM = 3.0, 0.3, 1.5
-"""Scores in the search for poses: a covered pixel of the region counts 1, one in a narrow notch
-`_NOTCH`, one outside the region `-_OUTSIDE`, and an outline that coincides with the region's
-`_RIM`."""
+"""The number of initial poses that are refined for each recess."""
+_OUTSIDE = 3.0
+"""In the search for poses, the penalty of a covered pixel outside the region. A covered pixel of
+the region scores 1."""
+_NOTCH = 0.3
+"""In the search for poses, the score of a covered pixel in a narrow notch of the region."""
+_RIM = 1.5
+"""In the search for poses, the score of an outline that coincides with the region's outline."""
 _INSIDE = 0.94
 """The least share of a recess's area that must lie within the region."""
 _NEAR = 0.0025
-"""A point of an object's outline is shared with the region's outline if it is closer to it than
-this, in metres."""
-_SHARED, _COST = 0.45, 0.0010
-"""The least share of an outline's points that must be shared, and the largest mean distance of
-these points from the region's outline, in metres."""
-_CLEARLY, _UNEXPLAINED = 0.65, 0.15
-"""The objects found in a region may leave a part of it unexplained. If this part is more than the
-share `_UNEXPLAINED` of the region's area, each object must share at least `_CLEARLY` of its
-outline's points with the region's outline."""
+"""The largest distance, in metres, at which a point of an object's outline counts as shared with
+the region's outline."""
+_SHARED = 0.45
+"""The least share of an object's outline that must be shared with the region's outline."""
+_COST = 0.0010
+"""The largest mean distance, in metres, of an outline's shared points from the region's outline."""
+_UNEXPLAINED = 0.15
+"""If the objects found in a region leave more than this share of its area, each of them must agree
+clearly (`_CLEARLY`) with the region's outline."""
+_CLEARLY = 0.65
+"""The least share of the outline of an object that agrees clearly with the region's outline."""
 _LEAST_PART = 0.35
-"""A region whose area is less than this share of a recess's contains no object of that recess."""
-_HIGHER, _ACROSS = 0.006, 6
-"""Something lies on an object if it is higher than the object's median height by the first number,
-in metres, and has at least as many pixels as the second number on both sides of the object's
-outline."""
+"""A region whose area is less than this share of a recess's area contains no object of that
+recess."""
+_HIGHER = 0.006
+"""The least height, in metres, above an object's median height of something that lies on it."""
+_ACROSS = 6
+"""The least number of pixels, on each side of an object's outline, of something that lies across
+the outline."""
 _SLIVER = 1
 """The rest of a region is thinned by this many pixels, to drop slivers."""
 _LEAST_REST = 0.0002
@@ -65,6 +72,7 @@ class _Found:
     """An object found within a region by the outline of a recess."""
 
     recess: int
+    """The index of the recess."""
     mask: Mask
     """(rows, cols) mask of the object."""
     shared: float
@@ -141,7 +149,7 @@ def _split(
 
 
 def _rest(rest: Mask, relief: NDArray[np.float32], resolution: float) -> list[Region]:
-    """The objects in the rest of a region; slivers are dropped."""
+    """Returns the objects in the rest of a region, without slivers."""
     core = ndimage.binary_erosion(rest, iterations=_SLIVER)
     labels, count = ndimage.label(ndimage.binary_propagation(core, mask=rest))
     regions = (labels == number for number in range(1, count + 1))
@@ -180,7 +188,8 @@ def _judge(
     relief: NDArray[np.float32],
     resolution: float,
 ) -> _Found | None:
-    """The object at a fit; None if the outlines do not agree well enough."""
+    """Returns the object that a fitted outline of a recess shows; None if the outlines do not agree
+    well enough."""
     rows, cols = np.indices(region.shape)
     positions = np.stack([rows, cols], axis=-1).reshape(-1, 2)
     back = (positions - fit.shift) @ rotation_matrix(fit.rotation)
@@ -257,7 +266,7 @@ def _starts(
 
 
 def _distinct(found: list[tuple[float, float, Array]]) -> list[tuple[float, float, Array]]:
-    """The best initial poses whose rotations are not neighbours."""
+    """Returns the best initial poses whose rotations differ clearly."""
     kept: list[tuple[float, float, Array]] = []
     for item in found:
         if all(abs(math.remainder(item[1] - other[1], math.tau)) > 0.2 for other in kept):

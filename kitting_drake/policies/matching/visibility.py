@@ -21,22 +21,25 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _MARGIN = 0.010
-"""A pick must be at least this far inside the cameras' views, in metres."""
+"""The least distance, in metres, of a pick from the edge of the cameras' views."""
 _AROUND = 5
-"""Side of the square around a pick of which more than half must be seen, in pixels."""
-_LANDING, _SWEPT = 0.5, 0.5
-"""The least shares that must be seen of the area on which each finger comes down, and of the area
-that the jaws sweep while closing."""
+"""The side, in pixels, of the square around a pick. More than half of the square must be seen."""
+_LANDING = 0.5
+"""The least share of the area under each finger of the open jaws that must be seen."""
+_SWEPT = 0.5
+"""The least share of the area that the jaws sweep while closing that must be seen."""
 _LINES, _DEPTHS, _SWEEPS = 5, 4, 17
-"""Numbers of samples along the pads, across a finger, and from finger to finger."""
+"""The numbers of samples along the pads, across a finger, and from finger to finger."""
 _INSIDE = 0.9
 """The least share of an object that must lie within the workspace at its place."""
 _OUT_OF_VIEW = 0.02
 """The largest share of an object that may lie outside all cameras' views at its place."""
 _RING = 3
-"""The surroundings of a place extend this far from the object, in pixels."""
-_RING_SEEN, _PLACE_SEEN = 0.5, 0.25
-"""The least shares that must be seen of the surroundings of a place and of the place itself."""
+"""How far the surroundings of a place extend from the object, in pixels."""
+_RING_SEEN = 0.5
+"""The least share of the surroundings of a place that must be seen."""
+_PLACE_SEEN = 0.25
+"""The least share of a place that must be seen."""
 _BLIND = 0.020
 """The radius that is assumed for an object of unknown outline, in metres."""
 
@@ -130,7 +133,7 @@ class Visibility:
 
 
 def _at(mask: Mask, positions: Array) -> Mask:
-    """The values of a mask at positions (..., 2) in pixels; True outside the mask."""
+    """Returns the values of a mask at positions (..., 2) in pixels; True outside the mask."""
     row, col = np.moveaxis(np.rint(positions).astype(int), -1, 0)
     rows, cols = mask.shape
     outside = (row < 0) | (row >= rows) | (col < 0) | (col >= cols)
