@@ -182,7 +182,7 @@ def _group_name(seed: int) -> str:
 
 @contextlib.contextmanager
 def _created(path: Path, origin: Origin, rejected: Iterable[Rejection]) -> Iterator[h5py.File]:
-    """Yields a new file of demonstrations, and moves it into place when it is complete."""
+    """Opens a new file of demonstrations, and moves it to `path` when it is complete."""
     scratch = path.with_name(f".{path.name}.scratch")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -239,8 +239,8 @@ def _opened(path: Path, *, keep: bool = False) -> Iterator[h5py.File]:
     """Opens a file of demonstrations, turning any failure into a UserError.
 
     Args:
-        path: path of the file.
-        keep: whether to leave the file open as long as its datasets are in use.
+        path: the path of the file.
+        keep: whether the file stays open as long as its datasets are in use.
     """
     if not path.is_file():
         raise UserError(f"there is no file {path}: make it with python -m kitting_drake.collect")
@@ -267,8 +267,9 @@ def _opened(path: Path, *, keep: bool = False) -> Iterator[h5py.File]:
         raise UserError(f"cannot read {path}: {error.strerror}") from error
     except (OSError, LookupError, TypeError, AttributeError, ValueError, RuntimeError) as error:
         # h5py may raise any of these for damaged bytes.
+        detail = f" ({error})" if isinstance(error, (OSError, ValueError)) else ""
         raise UserError(
-            f"{path} is truncated or damaged: delete it and collect again ({error})"
+            f"{path} is truncated or damaged{detail}: delete it and collect again"
         ) from error
 
 
@@ -327,8 +328,8 @@ def _read_group(group: h5py.Group, grid: PixelGrid) -> Demonstration:
 
 
 def _checked(group: h5py.Group, name: str, shape: tuple[int, ...], digest: Any) -> h5py.Dataset:
-    """Returns a dataset after a check of its shape and for finite entries. Adds its content to a
-    digest."""
+    """Checks a dataset's shape and that its entries are finite, adds its content to a digest, and
+    returns it."""
     dataset = group[name]
     values = dataset[()]
     if values.shape != shape:
@@ -340,5 +341,5 @@ def _checked(group: h5py.Group, name: str, shape: tuple[int, ...], digest: Any) 
 
 
 def content_digest(demonstrations: Iterable[Demonstration]) -> str:
-    """A digest of the content of demonstrations that were read from a file."""
+    """Returns a digest of the content of demonstrations that were read from a file."""
     return hashlib.sha256(repr([(d.seed, d.digest) for d in demonstrations]).encode()).hexdigest()

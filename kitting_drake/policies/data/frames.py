@@ -25,15 +25,15 @@ GRIPPER = "gripper"
 in m. In an action it is the opening towards which the fingers' springs pull, in m. An opening
 smaller than the held object grips it, and a negative one grips more firmly."""
 RATES = range(10, 31)
-"""Permitted frames per second."""
+"""The permitted numbers of frames per second."""
 DEFAULT_RATE = 16
-"""Default number of frames per second. It divides the 128 simulation steps of a second, so that
+"""The default number of frames per second. It divides the 128 simulation steps of a second, so that
 frames are equally far apart."""
 DEFAULT_WIDTH = 160
 
 
 def image_key(camera: str) -> str:
-    """The name of a camera's images in LeRobot datasets and environments."""
+    """Returns the name of a camera's images in LeRobot datasets and environments."""
     return f"observation.images.{camera}"
 
 
@@ -57,8 +57,13 @@ class FrameSettings:
             raise UserError(f"image_width is {self.width}: use at least 16")
 
     def size(self, width: int, height: int) -> tuple[int, int]:
-        """Width and height of a camera's recorded images, in pixels. They have the camera's aspect
-        ratio and are never larger than its images."""
+        """Returns the width and height of the recorded images of a camera, in pixels. They have the
+        camera's aspect ratio.
+
+        Args:
+            width: the width of the camera's own images, in pixels. Recorded images are not larger.
+            height: the height of the camera's own images, in pixels.
+        """
         scale = min(1.0, self.width / width)
         return max(1, round(scale * width)), max(1, round(scale * height))
 
@@ -93,9 +98,9 @@ class EpisodeFrames:
     action: NDArray[np.float32]
     """(n, entries) commanded positions, in m and rad, at the time of the next frame."""
     reward: NDArray[np.float32]
-    """(n) the task's reward that is earned between a frame and the next."""
+    """(n) the task's reward that is earned between each frame and the next frame."""
     success: NDArray[np.bool_]
-    """(n) whether every goal is filled at the next frame."""
+    """(n) whether every goal is filled at the frame after each frame."""
     images: dict[str, list[bytes]] = field(default_factory=dict)
     """For each camera, the PNG of each frame."""
 

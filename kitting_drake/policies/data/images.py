@@ -23,12 +23,12 @@ _CURVATURE_STD = 0.2
 """The standard deviation of both coefficients of a random curvature (see `curved_crop`)."""
 _FARTHEST_CURVED = 1.4
 """The distance from the pick beyond which the displacements of a curved crop stop growing, in half
-sides of the crop. It is the distance of the crop's corners."""
+sides of the crop. The crop's corners are about this far from the pick."""
 _ROTATION_STD = math.radians(60)
 """The standard deviation of augmentation's rotations in radians, as in the authors' code."""
 _SHIFT_STD = 1 / 6
-"""The standard deviation of augmentation's shifts, in sides of the image. Ravens uses the shorter
-side for both axes; here shifts along the longer side are twice as large."""
+"""The standard deviation of augmentation's shifts, as a share of the image's side along each axis.
+Ravens uses the shorter side for both axes."""
 
 
 class Pictured(Protocol):
@@ -74,11 +74,11 @@ class LabelledImage:
         )
 
     def place_of(self, pixel: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(row, col) where the object's point at `pixel` is to go."""
+        """Returns the (row, col) where the object's point at `pixel` is to go."""
         return self.place + rotation_matrix(self.rotation) @ (pixel - self.pick)
 
     def curved_crop(self, index: int, pixel: tuple[int, int], side: int) -> Image:
-        """A crop in which the object is bent: curvature augmentation.
+        """Returns a crop in which the object is bent (curvature augmentation).
 
         Let u be the distance from the pick along the gripper's angle, in half sides of the crop. A
         curvature (a, b) shifts the image at u across that direction by a u^2 + b u^3 half sides.
@@ -87,7 +87,7 @@ class LabelledImage:
 
         Args:
             index: 0 for the pick, 1 + i for other pick i.
-            pixel: the centre of the crop, near that pick.
+            pixel: the centre (row, col) of the crop, near the pick of this index.
             side: the side of the crop, odd, in pixels.
 
         Returns:
@@ -118,7 +118,8 @@ def make_action(
     place: NDArray[np.float64],
     rotation: float,
 ) -> PickPlaceAction:
-    """The action of a prediction in pixels; the inverse of `LabelledImage.from_action`.
+    """Converts a prediction in pixels to an action in the world; the inverse of
+    `LabelledImage.from_action`.
 
     The planner reads the heights from the observation.
 
@@ -163,29 +164,31 @@ class Motion:
         return (np.array(self.image.shape[1:]) - 1) / 2
 
     def after(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(..., 2): the positions (..., 2) after the motion."""
+        """Returns the positions (..., 2) of pixels after the motion."""
         rotated = (pixels - self.middle) @ rotation_matrix(self.angle).T
         return rotated + self.middle + self.shift
 
     def before(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(..., 2): the positions (..., 2) before the motion; the inverse of `after`."""
+        """Returns the positions (..., 2) of pixels before the motion; the inverse of `after`."""
         return (pixels - self.middle - self.shift) @ rotation_matrix(self.angle) + self.middle
 
     def moved_image(self) -> Image:
-        """The image after the motion, of the same size."""
+        """Returns the image after the motion. It has the same size."""
         rows, cols = self.image.shape[1:]
         target = np.stack(np.meshgrid(np.arange(rows), np.arange(cols), indexing="ij"), axis=-1)
         return nearest(self.image, self.before(target.astype(float)))
 
 
 def rotation_matrix(angle: float) -> NDArray[np.float64]:
-    """(2, 2): rotates (row, col) vectors counter-clockwise by an angle in radians."""
+    """Returns the matrix (2, 2) that rotates (row, col) vectors counter-clockwise by an angle in
+    radians."""
     cos, sin = math.cos(angle), math.sin(angle)
     return np.array([[cos, -sin], [sin, cos]])
 
 
 def crop(image: Image, centre: tuple[int, int], side: int) -> Image:
-    """(channels, side, side) around a pixel, `side` odd; zero (unseen) outside the image."""
+    """Returns the part (channels, side, side) of an image around the pixel `centre`. `side` must be
+    odd. Pixels outside the image are zero (unseen)."""
     channels, rows, cols = image.shape
     reach = side // 2
     result = np.zeros((channels, side, side), image.dtype)
@@ -239,9 +242,10 @@ def _moved(sample: LabelledImage, motion: Motion) -> LabelledImage:
 
 
 def reflect(sample: LabelledImage) -> LabelledImage:
-    """The mirror image of a sample, with reversed columns and the labels of the mirrored scene.
+    """Returns the mirror image of a sample, with reversed columns and the labels of the mirrored
+    scene.
 
-    Networks that are equivariant to rotations alone see it as a new scene with new shapes.
+    For networks that are not equivariant to reflections it is a new scene with new shapes.
     """
     last = sample.image.shape[2] - 1
 
@@ -267,17 +271,18 @@ def augment(
     curvature: bool = False,
     reflection: bool = False,
 ) -> LabelledImage:
-    """A sample after a random SE(2) motion of the scene that keeps both labels inside the image.
+    """Returns a sample after a random SE(2) motion of the scene that keeps the pick and the place
+    inside the image.
 
-    Motions are drawn until one keeps them inside. After a hundred failed draws the sample is not
-    moved.
+    After a hundred draws without such a motion the sample is not moved.
 
     Args:
         sample: the sample.
         random: the generator of all random draws.
         curvature: whether to draw curvatures as well (see `LabelledImage.curved_crop`), so that
             pick angles are learned from bent objects. This is not in the paper.
-        reflection: whether to reflect every other sample first. This is not in the paper.
+        reflection: whether to reflect the sample first, with a probability of one half. This is not
+            in the paper.
     """
     if reflection and random.random() < 0.5:
         sample = reflect(sample)

@@ -42,9 +42,10 @@ Track = Callable[[Sequence[Path]], Iterable[Path]]
 """Iterates over files and shows progress, as `rich.progress.track` does."""
 
 _MOST_MEASURED = 50
-"""At most this many images of an episode, evenly spaced, are used for the statistics."""
+"""The largest number of images of an episode that are used for the statistics. They are evenly
+spaced."""
 _MEGABYTES = 100
-"""The size at which the next episode begins a new file of frames, in megabytes. It is LeRobot's
+"""The largest size of a file of frames with several episodes, in megabytes. It is LeRobot's
 default."""
 _FILES_PER_CHUNK = 1000
 _DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
@@ -113,7 +114,7 @@ def export_lerobot(
 
 
 def features(first: EpisodeFrames) -> dict[str, dict[str, Any]]:
-    """The `features` of `meta/info.json`, which are the columns of a frame.
+    """Returns the `features` of `meta/info.json`, which are the columns of a frame.
 
     Args:
         first: an episode, with at least one frame.
@@ -231,10 +232,13 @@ def _check_alike(read: EpisodeFrames, first: EpisodeFrames, source: Path) -> Non
         if getattr(read, name) != getattr(first, name):
             raise UserError(
                 f"{source}: {name} is {getattr(read, name)}, but {getattr(first, name)} in the "
-                "first episode"
+                "first episode: export only episodes with the same settings"
             )
     if list(read.images) != list(first.images) or not len(read):
-        raise UserError(f"{source}: it has other cameras than the first episode, or no frames")
+        raise UserError(
+            f"{source}: it has other cameras than the first episode, or no frames: export only "
+            "episodes with the same settings"
+        )
 
 
 def _statistics(
@@ -350,7 +354,7 @@ class _DataFiles:
 
 
 def _hugging_face(feature: dict[str, Any]) -> dict[str, Any]:
-    """A feature in the format of the package `datasets`."""
+    """Returns a feature in the format of the package `datasets`."""
     if feature["dtype"] == "image":
         return {"_type": "Image"}
     value = {"dtype": feature["dtype"], "_type": "Value"}

@@ -1,7 +1,7 @@
 """Computes the normalisation statistics of a LeRobotDataset (see `lerobot_export`).
 
-They equal those of `lerobot.datasets.compute_stats`, but use every pixel of an image instead of a
-subset.
+They are those of `lerobot.datasets.compute_stats`, but from every pixel of an image instead of a
+subset of the pixels.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 
 
 def statistics_of(values: NDArray[Any], *, image: bool) -> dict[str, NDArray[Any]]:
-    """LeRobot's statistics of a feature over all frames of an episode, and for images over all
-    pixels.
+    """Returns LeRobot's statistics of a feature over all frames of an episode. For images they
+    include all pixels.
 
     Args:
         values: (frames,), (frames, entries) or (frames, rows, cols, channels).
@@ -39,8 +39,10 @@ def statistics_of(values: NDArray[Any], *, image: bool) -> dict[str, NDArray[Any
 
 
 def aggregate(episodes: Sequence[dict[str, NDArray[Any]]]) -> dict[str, Any]:
-    """The statistics of all episodes together, computed as LeRobot's `aggregate_stats` does. A
-    quantile is the mean of the episodes' quantiles, weighted by their numbers of frames."""
+    """Returns the statistics of all episodes together, as LeRobot's `aggregate_stats` does.
+
+    A quantile is the mean of the episodes' quantiles, weighted by their numbers of frames.
+    """
     counts = np.array([item["count"][0] for item in episodes])
     stacked = {name: np.stack([item[name] for item in episodes]) for name in episodes[0]}
 

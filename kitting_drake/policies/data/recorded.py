@@ -38,7 +38,7 @@ class Stored:
         return cls(dataset.file, dataset.name, shape, dataset.dtype, row)
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
-        """The array, read from the file.
+        """Reads the array from the file.
 
         Raises:
             UserError: the file can no longer be read.
@@ -46,7 +46,9 @@ class Stored:
         try:
             values = self.file[self.dataset][() if self.row is None else self.row]
         except (OSError, LookupError, RuntimeError) as error:
-            raise UserError(f"cannot read {self.dataset} from its file again: {error}") from error
+            raise UserError(
+                f"cannot read the demonstration {self.dataset} again: its file is damaged"
+            ) from error
         return np.asarray(values, dtype)
 
 

@@ -23,8 +23,8 @@ class HeightsOnly:
 
     @property
     def image(self) -> Image:
-        """(4, rows, cols) image with black colours and unseen heights filled in. It is computed at
-        each access."""
+        """The image (4, rows, cols), with black colours and with unseen heights filled in. It is
+        computed at each access."""
         image = self.recorded.image
         image[3] = fill_unseen(image[3], np.any(image, axis=0))
         image[:3] = 0
@@ -58,7 +58,8 @@ class ObservedScene:
 
     @property
     def targets(self) -> tuple[LabelledImage, ...]:
-        """A label for each action. Each access computes the image anew, once for all labels."""
+        """A labelled image for each action. They share one image, which each access computes
+        anew."""
         image = self.recorded.image
         return tuple(LabelledImage.from_action(image, action, self.grid) for action in self.actions)
 
@@ -66,7 +67,7 @@ class ObservedScene:
 def scenes(
     demonstrations: Iterable[Demonstration], grid: PixelGrid, *, later_picks_possible: bool
 ) -> list[ObservedScene]:
-    """All observations, of some demonstrations, in which something is left to pick.
+    """Returns the demonstrations' observations in which something is left to pick.
 
     Args:
         demonstrations: the demonstrations of an expert.
@@ -84,20 +85,20 @@ def scenes(
 
 
 def final_observations(demonstrations: Iterable[Demonstration]) -> list[FinalObservation]:
-    """The observations, of some demonstrations, in which nothing is left to pick."""
+    """Returns the demonstrations' observations in which nothing is left to pick."""
     return [item.final for item in demonstrations if item.final is not None]
 
 
 def labelled_images(
     observed: Iterable[ObservedScene], *, taken_only: bool
 ) -> Sequence[LabelledImage]:
-    """The training samples; their images are made on demand.
+    """Returns the training samples. Their images are made on demand.
 
     Args:
         observed: the observations.
         taken_only: whether to make only one sample for each observation, with the action that the
             expert took, as in the paper. Otherwise there is one sample for each possible action,
-            with the others as `other_picks`.
+            with the picks of the other actions as `other_picks`.
     """
     return _Samples(list(observed), taken_only)
 

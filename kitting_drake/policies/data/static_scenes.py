@@ -8,8 +8,8 @@ and `versions`, and these datasets for n scenes with m actions in all:
   filled in (`Observation.filled_height`);
 - `actions` (m, 8): number of the object, cost of the grasp, pick x, y, theta, place x, y, theta, in
   metres and radians;
-- `first` (n + 1,): scene i has the actions `first[i]` to `first[i + 1]`; a scene without actions is
-  final;
+- `first` (n + 1,): scene i has the actions from `first[i]` up to but not including `first[i + 1]`.
+  In a scene without actions nothing is left to pick;
 - `batch_ends` (b,): the number of scenes up to the end of each batch. Scenes share tools only
   within a batch. Older files lack this dataset.
 """
@@ -75,7 +75,7 @@ class StaticScene:
         return image
 
     def label(self, image: NDArray[np.float32], row: int, grid: PixelGrid) -> LabelledImage:
-        """The labelled image of one action."""
+        """Returns an image labelled with the action in one row of `actions`."""
         _, _, x, y, theta, place_x, place_y, place_theta = self.actions[row]
         return LabelledImage(
             image=image,
@@ -101,13 +101,13 @@ class StaticScenes:
         object.__setattr__(self, "batch_ends", self.batch_ends or (len(self.scenes),))
 
     def part(self, first: int, last: int) -> StaticScenes:
-        """The scenes from index `first` up to but not including `last`."""
+        """Returns the scenes from index `first` up to but not including `last`."""
         scenes = self.scenes[first:last]
         inside = (end - first for end in self.batch_ends if first < end < first + len(scenes))
         return dataclasses.replace(self, scenes=scenes, batch_ends=(*inside, len(scenes)))
 
     def digest(self) -> str:
-        """A digest of all heights and actions."""
+        """Returns a digest of all heights and actions."""
         found = hashlib.sha256()
         for scene in self.scenes:
             found.update(np.ascontiguousarray(scene.height).tobytes())
@@ -173,7 +173,8 @@ def read_static_scenes(path: Path) -> StaticScenes:
             _check_batches(ends, len(scenes))
     except (OSError, LookupError, ValueError, TypeError, AttributeError, RuntimeError) as error:
         # h5py may raise any of these for damaged bytes.
-        raise UserError(f"cannot read {path}: {error}") from error
+        reason = error if isinstance(error, (OSError, ValueError)) else "it is damaged"
+        raise UserError(f"cannot read {path}: {reason}") from error
     return StaticScenes(grid, scenes, seed, versions, tuple(ends.tolist()))
 
 
@@ -182,7 +183,9 @@ def _check(heights: NDArray, actions: NDArray, first: NDArray, grid: PixelGrid) 
     if heights.shape[1:] != grid.shape or heights.dtype != np.uint16:
         raise ValueError(f"its heights have the wrong shape {heights.shape} or type")
     if actions.ndim != 2 or actions.shape[1] != 8 or not np.isfinite(actions).all():
-        raise ValueError(f"its actions must be rows of 8 numbers, not {actions.shape}")
+        raise ValueError(
+            f"its actions must be rows of 8 finite numbers, but have the shape {actions.shape}"
+        )
     bounds = first.shape == (len(heights) + 1,) and first.dtype.kind in "iu"
     if not bounds or first[0] != 0 or first[-1] != len(actions) or (np.diff(first) < 0).any():
         raise ValueError("its dataset `first` does not assign each action to one scene")
@@ -198,8 +201,8 @@ def _check_batches(ends: NDArray, count: int) -> None:
 class StaticSamples(Sequence[LabelledImage]):
     """Samples drawn from static scenes on demand.
 
-    A sample has one grasp of each loose object, which is drawn with a probability that depends on
-    its cost. Over many samples a network learns the distribution of all feasible grasps.
+    A sample has one grasp of each loose object. Grasps with a lower cost are drawn more often. Over
+    many samples a network learns the distribution of all feasible grasps.
     """
 
     def __init__(self, content: StaticScenes) -> None:

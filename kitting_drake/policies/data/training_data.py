@@ -98,7 +98,7 @@ class TrainingData:
         return tuple(range(1, self.count + 1))
 
     def part(self, first: int, last: int) -> TrainingData:
-        """The items from index `first` up to but not including `last`."""
+        """Returns the items from index `first` up to but not including `last`."""
         if isinstance(self.items, StaticScenes):
             return dataclasses.replace(self, items=self.items.part(first, last))
         items = self.items[first:last]
@@ -110,11 +110,11 @@ class TrainingData:
         )
 
     def scenes(self, most: int | None = None) -> list[ObservedScene]:
-        """The observations in which something is left to pick.
+        """Returns the observations in which something is left to pick.
 
         Args:
-            most: the largest number of observations to return, which are chosen evenly; None for
-                all.
+            most: the largest number of observations to return; None for all. They are evenly
+                spaced.
         """
         if not isinstance(self.items, StaticScenes):
             possible = self.learning.later_picks_possible
@@ -131,8 +131,8 @@ class TrainingData:
         return result
 
     def finals(self, most: int | None = None, *, colour: bool = True) -> Sequence[Pictured]:
-        """The observations in which nothing is left to pick. For the arguments see `scenes` and
-        `samples`."""
+        """Returns the observations in which nothing is left to pick. For the arguments see `scenes`
+        and `samples`."""
         if not isinstance(self.items, StaticScenes):
             found = evenly_chosen(final_observations(self.items), most)
             return found if colour else [HeightsOnly(final) for final in found]
@@ -140,7 +140,7 @@ class TrainingData:
         return [_recorded(FinalObservation, item.image) for item in evenly_chosen(seated, most)]
 
     def samples(self, *, taken_only: bool, colour: bool = True) -> Sequence[LabelledImage]:
-        """The training samples, from the observations in which something is left to pick.
+        """Returns training samples from the observations in which something is left to pick.
 
         Args:
             taken_only: whether to use only the actions that the expert took, see `labelled_images`.
@@ -157,7 +157,8 @@ class TrainingData:
         return labelled_images(found, taken_only=taken_only)
 
     def shares_scenes(self, other: TrainingData) -> int | None:
-        """A seed for which both data sets hold the same scene; None if there is none."""
+        """Returns a seed for which this and another data set hold the same scene; None if there is
+        none."""
         shared = set(self.seeds) & set(other.seeds)
         same = all(_alike(self.origin.get(key), other.origin.get(key)) for key in _TABLE)
         return min(shared) if shared and same else None
@@ -173,7 +174,7 @@ def _alike(one: Any, other: Any) -> bool:
 
 
 def evenly_chosen(items: list[Item], most: int | None) -> list[Item]:
-    """Chooses at most `most` items, evenly spaced; all of them if it is None."""
+    """Chooses at most `most` items, evenly spaced; all items if `most` is None."""
     count = len(items) if most is None else min(len(items), most)
     return [items[i * len(items) // count] for i in range(count)]
 
@@ -186,7 +187,7 @@ def read_training_data(path: Path) -> TrainingData:
     """Reads a file of demonstrations or of static scenes.
 
     Raises:
-        UserError: the file is neither, unreadable or empty.
+        UserError: the file is of neither kind, unreadable or empty.
     """
     if is_static_scenes(path):
         content = read_static_scenes(path)

@@ -19,8 +19,7 @@ class AngleNetSize:
     """The depth and width of a pick-angle network."""
 
     stages: tuple[tuple[int, ...], ...]
-    """For each stage, the number of fields of each of its layers. Features are pooled between
-    stages."""
+    """For each stage, the numbers of fields of its layers. Features are pooled between stages."""
     kernel: int = 7
     """The side of each layer's kernels, in pixels."""
     readout: int = 7
@@ -29,12 +28,16 @@ class AngleNetSize:
     """Whether the last layer's kernel covers the whole feature map. Otherwise the last layer is
     padded, and its output is averaged."""
     residual: bool = False
-    """Whether a stage of two layers is a residual block. If the number of fields changes, its
-    shortcut is a convolution of the same kernel size. Not allowed in the first stage."""
+    """Whether each stage of two layers is a residual block; the first stage must then not have two
+    layers. If a block changes the number of fields, its shortcut is a convolution with the same
+    kernel size."""
 
     def __post_init__(self) -> None:
         if self.residual and len(self.stages[0]) == 2:
-            raise ValueError("the first stage takes scalars and cannot be a residual block")
+            raise ValueError(
+                "the first stage takes scalars and cannot be a residual block: give it one layer, "
+                "or more than two"
+            )
 
 
 class AngleNet(MixedPrecision):

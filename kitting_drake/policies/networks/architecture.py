@@ -37,10 +37,11 @@ class Preset:
             stages=((18,), (36, 36), (18, 18), (18, 18), (8,)), residual=True
         )
     )
-    """The Equivariant Transporter's angle network, in regular fields of N / 2 channels. The default
-    has the authors' 0.90, 1.81, 3.01 and 4.51 M parameters at N = 36, 72, 120, 180."""
+    """The size of the Equivariant Transporter's angle network, whose fields are regular and have
+    N / 2 channels. The default gives as many parameters as the authors report: 0.90, 1.81, 3.01 and
+    4.51 million at N = 36, 72, 120 and 180."""
     resnet: tuple[int, int, int, int, int] = (64, 64, 128, 256, 512)
-    """Channels of the Transporter's stem and of its four stages."""
+    """The numbers of channels of the Transporter's stem and of its four stages."""
 
 
 _SMALL = Preset(
@@ -62,7 +63,7 @@ PRESETS = {
     "paper": Preset(),
     # For machines without an accelerator: each U-net has 0.2 M parameters.
     "small": _SMALL,
-    # "small", with baselines that are reduced by the same factor as the SO(2) networks: the
+    # As "small", but the baselines are reduced by the same factor as the SO(2) networks. The
     # Transporter has 1/25 of the original's parameters. At N = 36 the Equivariant Transporter's
     # angle network has as many parameters as beta.
     "matched": dataclasses.replace(

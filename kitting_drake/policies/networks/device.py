@@ -17,13 +17,14 @@ _SHAPES = ((1, 32, 81, 161), (32, 32, 3, 3))
 
 
 def preferred_device() -> torch.device:
-    """The device for training and inference: an accelerator if available, otherwise the CPU."""
+    """Returns the device for training and inference: a GPU if there is one, otherwise the CPU."""
     return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
 @functools.cache
 def preferred_type() -> torch.dtype:
-    """The type to compute in: bfloat16 if the preferred device is faster in it, otherwise float32.
+    """Returns the type to compute in: bfloat16 if the preferred device is faster in it, otherwise
+    float32.
 
     Convolutions in bfloat16 take a fifth of the time with AMX. With AVX-512 alone they take between
     0.5 and 1.5 times as long, depending on the CPU, so one is timed once per process.
@@ -41,7 +42,10 @@ def preferred_type() -> torch.dtype:
 
 
 def _is_faster_in_bfloat16() -> bool:
-    """Compares the fastest of several alternating convolutions in each type."""
+    """Whether a convolution is clearly faster in bfloat16 than in float32.
+
+    Compares the fastest of several runs in each type.
+    """
     fastest = dict.fromkeys((torch.float32, torch.bfloat16), float("inf"))
     threads = torch.get_num_threads()
     # Use one thread: on shared cores, threads that wait for each other would add processor time.
@@ -57,7 +61,8 @@ def _is_faster_in_bfloat16() -> bool:
 
 @torch.inference_mode()
 def _seconds(dtype: torch.dtype) -> float:
-    """The processor time of one convolution, which other processes barely affect."""
+    """Returns the processor time of one convolution, in seconds. Other processes barely affect
+    it."""
     features, kernel = (
         torch.ones(shape, dtype=dtype).to(memory_format=torch.channels_last) for shape in _SHAPES
     )

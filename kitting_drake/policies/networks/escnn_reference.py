@@ -1,4 +1,4 @@
-"""The SO(2) networks built from escnn's own modules, as the reference for the folded convolutions.
+"""The SO(2) networks built from escnn's own modules, as a reference for `SteerableConv2d`.
 
 They copy the weights of this package's networks and compute the same function. Their features are
 Fourier coefficients, which FourierELU transforms to samples and back. Only the benchmark and the
@@ -27,7 +27,7 @@ _SIGMA = 0.66
 
 
 def as_escnn(networks: SO2Networks, autocast: torch.dtype | None = None) -> Networks:
-    """The same networks built from escnn's modules.
+    """Returns the same networks, built from escnn's modules.
 
     Args:
         networks: networks made with `SteerableConv2d`; their weights are copied.
@@ -72,8 +72,8 @@ class EscnnUNet(nn.Module):
                 # escnn's R2Upsampling computes the same, but needs the size at construction.
                 larger = enn.GeometricTensor(upsample(features.tensor), features.type)
                 features = block(enn.tensor_directsum([larger, levels.pop()]))
-            # Change the type of the field: to escnn, frequency 0 alone differs from the trivial
-            # representation.
+            # escnn distinguishes a field of frequency 0 alone from a trivial field, so change its
+            # type.
             scalars = enn.GeometricTensor(features.tensor, self.mix.in_type)
             return self.out(self.mix_elu(self.mix(scalars))).tensor.float()
 
@@ -101,7 +101,7 @@ class _EscnnBlock(nn.Module):
         self.out_type = self.elu.out_type
 
     def forward(self, features: enn.GeometricTensor) -> enn.GeometricTensor:
-        """Maps (batch, coefficients, rows, cols) to the same rows and cols."""
+        """Maps (batch, coefficients in, rows, cols) to (batch, coefficients out, rows, cols)."""
         hidden = self.second(self.first_elu(self.first(features)))
         return self.elu(hidden + self.shortcut(features))
 
@@ -171,7 +171,7 @@ def _convolution(source: nn.Module) -> enn.R2Conv:
 
 
 def _fourier_elu(source: nn.Module, *, invariant: bool = False) -> enn.FourierELU:
-    """The nonlinearity after a convolution, with as many samples as its output fibre."""
+    """Makes the nonlinearity after a convolution, with the output fibre's number of samples."""
     assert isinstance(source, SteerableConv2d)
     assert isinstance(source.out_fibre, Irreps)
     return enn.FourierELU(

@@ -140,8 +140,9 @@ class Networks(nn.Module):
             images: (n, 4, rows, cols), each as `Observation.image`.
 
         Returns:
-            (n, channels, rows, cols): normalised, in `compute_type`, on `device`. Zero padding
-            below and on the right, before normalisation, extends the sides to sizes of a U-net.
+            (n, channels, rows, cols): normalised, in `compute_type`, on `device`. Before they are
+            normalised, the images are padded with zeros below and on the right, to sides that a
+            U-net can take.
         """
         config = self.config
         rows, cols = images.shape[2:]
@@ -154,11 +155,11 @@ class Networks(nn.Module):
         return normalised.to(self.device, self.compute_type)
 
     def encode_scene(self, image: Image) -> Tensor:
-        """phi(o_t): (1, channels, rows, cols), including the padding."""
+        """Returns phi(o_t), (1, channels, rows, cols). Rows and cols include the padding."""
         return self.phi(self.prepare(image))
 
     def encode_crop(self, image: Image, pixel: tuple[int, int]) -> Tensor:
-        """psi(c_2) for the crop around a pixel: (1, channels, side, side)."""
+        """Returns psi(c_2) for the crop around a pixel, (1, channels, side, side)."""
         return self.psi(self.prepare(crop(image, pixel, sizes.PLACE_CROP)))
 
     def check_orientations(self, orientations: int) -> None:
@@ -206,7 +207,7 @@ class Networks(nn.Module):
         pixels: list[tuple[int, int]],
         random: np.random.Generator,
     ) -> Iterator[tuple[str, Callable[[], Tensor]]]:
-        """The losses of the picking module.
+        """Yields the names and losses of the picking module, as `losses` does.
 
         Args:
             sample: the training sample.
@@ -216,7 +217,7 @@ class Networks(nn.Module):
         raise NotImplementedError
 
     def stop_loss(self, image: Image, random: np.random.Generator) -> Tensor:
-        """The cross-entropy for an observation with nothing to pick.
+        """Returns the cross-entropy for an observation with nothing to pick.
 
         Args:
             image: the observation.
@@ -225,7 +226,7 @@ class Networks(nn.Module):
         raise NotImplementedError
 
     def place_loss(self, sample: LabelledImage, pixel: tuple[int, int], seed: int) -> Tensor:
-        """The loss of the placing module.
+        """Returns the loss of the placing module.
 
         Args:
             sample: the training sample.
@@ -243,7 +244,7 @@ class Networks(nn.Module):
         )
 
     def modules_by_loss(self) -> dict[str, list[nn.Module]]:
-        """The modules that each loss trains. Each loss has its own optimiser."""
+        """Returns the modules that each loss trains. Each loss has its own optimiser."""
         raise NotImplementedError
 
 
@@ -255,7 +256,7 @@ class FactoredNetworks(Networks):
     picking = "pick_position"
 
     def position_logits(self, image: Image) -> Tensor:
-        """(rows, cols): the logits of the pick position, f_p of the paper."""
+        """Returns the logits (rows, cols) of the pick position, f_p of the paper."""
         rows, cols = image.shape[1:]
         return self.alpha(self.prepare(image))[0, 0, :rows, :cols]
 
@@ -298,8 +299,8 @@ class FactoredNetworks(Networks):
         yield "pick_angle", lambda: self._angle_loss(sample, pixels)
 
     def _angle_loss(self, sample: LabelledImage, pixels: list[tuple[int, int]]) -> Tensor:
-        """The mean loss over the crops of all picks and, if there are curvatures, over their bent
-        copies."""
+        """Returns the mean loss over the crops of all picks. If the sample has curvatures, the mean
+        includes a bent copy of each crop."""
         orientations = self.config.orientations
         crops = [crop(sample.image, pixel, sizes.PICK_CROP) for pixel in pixels]
         thetas = [sample.pick_theta, *sample.other_thetas]
@@ -329,8 +330,8 @@ class FactoredNetworks(Networks):
 
 
 class SO2Networks(FactoredNetworks):
-    """The networks of the paper's own method: hidden fields of SO(2) irreps, and an irrep vector
-    that is discretized to angles."""
+    """The networks of the paper's own method. Their hidden fields are irreps of SO(2), and beta's
+    output vector of irreps is discretized to angles."""
 
     def __init__(self, config: NetworkConfig, convolution: Convolution = SteerableConv2d) -> None:
         super().__init__(config)
@@ -360,7 +361,7 @@ class SO2Networks(FactoredNetworks):
 
 
 def within_image(sample: LabelledImage) -> LabelledImage:
-    """The sample without those of its `other_picks` that lie outside the image."""
+    """Returns the sample without those of its `other_picks` that lie outside the image."""
     rows, cols = sample.image.shape[1:]
     picks = sample.other_picks
     inside = ((picks >= 0) & (picks <= (rows - 1, cols - 1))).all(axis=1)

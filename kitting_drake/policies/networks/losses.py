@@ -29,9 +29,10 @@ NOTHING_LOGIT = math.log(160 * 320)
 even odds for an image of the paper's size."""
 
 _WINDOW = 17
-"""The side of the window of the plain correlation around a label, in pixels."""
+"""The side, in pixels, of the window around a label in which the full correlation is computed."""
 _FINE_REACH = math.radians(10)
-"""How far the window of the plain correlation extends from the label's rotation, in radians."""
+"""The largest difference, in radians, from a label's rotation at which the full correlation is
+computed."""
 
 
 def interpolate_label(
@@ -41,8 +42,9 @@ def interpolate_label(
 
     Args:
         position: the position, in bins.
-        count: the number of bins. Weight of positions beyond them goes to the outermost bin.
-        cyclic: whether the bins wrap around.
+        count: the number of bins.
+        cyclic: whether the bins wrap around. Otherwise the weight of a position beyond the bins
+            goes to the outermost bin.
     """
     first = math.floor(position)
     share = position - first
@@ -53,7 +55,7 @@ def interpolate_label(
 
 
 def soft_label(*axes: list[tuple[int, float]], like: Tensor) -> Tensor:
-    """The outer product of one interpolated label per axis, shaped as `like`."""
+    """Returns the outer product of one interpolated label per axis, in the shape of `like`."""
     label = torch.zeros_like(like)
     corners: list[tuple[tuple[int, ...], float]] = [((), 1.0)]
     for axis in axes:
@@ -66,23 +68,25 @@ def soft_label(*axes: list[tuple[int, float]], like: Tensor) -> Tensor:
 
 
 def cross_entropy(logits: Tensor, label: Tensor) -> Tensor:
-    """The cross-entropy of a softmax over all entries of `logits`, for a label of their shape."""
+    """Returns the cross-entropy of a softmax over all entries of `logits`, for a label of the same
+    shape."""
     return logits.flatten().logsumexp(0) - (label * logits).sum()
 
 
 def log_odds(logits: Tensor, orientations: int = 1) -> Tensor:
-    """The log-odds that there is something to pick, against the class "nothing to pick".
+    """Returns the log-odds that there is something to pick.
 
     Args:
         logits: the logits of all actions, (rows, cols), or (orientations, rows, cols) if they are
             predicted jointly.
-        orientations: the number of orientations in `logits`; the odds are corrected for it.
+        orientations: the number of orientations that `logits` stand for; the odds are divided by
+            it.
     """
     return logits.flatten().logsumexp(0) - math.log(orientations) - NOTHING_LOGIT
 
 
 def presence_loss(odds: Tensor, *, present: bool) -> Tensor:
-    """The cross-entropy of the classes "something to pick" and "nothing to pick".
+    """Returns the cross-entropy of the classes "something to pick" and "nothing to pick".
 
     Args:
         odds: the result of `log_odds`.
@@ -92,7 +96,7 @@ def presence_loss(odds: Tensor, *, present: bool) -> Tensor:
 
 
 def position_loss(logits: Tensor, *pixels: tuple[float, float]) -> Tensor:
-    """Cross-entropy over the pixels of the pick position f_p.
+    """Returns the cross-entropy over the pixels of the pick position f_p.
 
     Args:
         logits: (rows, cols) logits of the pixels.
@@ -107,7 +111,7 @@ def position_loss(logits: Tensor, *pixels: tuple[float, float]) -> Tensor:
 
 
 def angle_loss(logits: Tensor, theta: float, orientations: int) -> Tensor:
-    """Cross-entropy over the orientations of the pick angle f_theta, modulo pi.
+    """Returns the cross-entropy over the orientations of the pick angle f_theta, modulo pi.
 
     Args:
         logits: (N / 2,) logits of the angles 2 pi i / N.
@@ -127,7 +131,8 @@ def place_loss(
     orientations: int,
     generator: torch.Generator,
 ) -> Tensor:
-    """An estimate of the cross-entropy over all pixels and rotations of f_place (equation 8).
+    """Returns an estimate of the cross-entropy over all pixels and rotations of f_place (equation
+    8).
 
     Near the label the full correlation is computed. Elsewhere each cell of the coarse volume stands
     for the pixels and rotations that it covers. The coarse volume has an additional cross-entropy
@@ -158,7 +163,7 @@ def place_loss(
     first = min(first, math.floor(rotation / step))
     last = max(math.floor((rotation + _FINE_REACH) / step), math.floor(rotation / step) + 1)
     margin = _WINDOW // 2
-    # The label lies anywhere in the central half of the window.
+    # Offset the window at random, such that the label lies in its central half.
     top = round(pixel[0]) - margin + round((draws[1] - 0.5) * margin)
     left = round(pixel[1]) - margin + round((draws[2] - 0.5) * margin)
     angles = torch.arange(first, last + 1, dtype=scene.dtype, device=scene.device) * step
@@ -179,7 +184,7 @@ def place_loss(
 
 
 def _covered(coarse: Tensor, differences: Tensor, corner: tuple[int, int]) -> Tensor:
-    """Mask of the coarse cells that lie inside the window around a label.
+    """Returns a mask (n, rows, cols) of the coarse cells inside the window around a label.
 
     Args:
         coarse: (n, rows, cols) scores at half the resolution.
@@ -199,7 +204,7 @@ def _covered(coarse: Tensor, differences: Tensor, corner: tuple[int, int]) -> Te
 def joint_loss(
     logits: Tensor, *labels: tuple[list[tuple[int, float]], tuple[float, float]]
 ) -> Tensor:
-    """Joint cross-entropy over orientations and pixels, as in the Transporter.
+    """Returns the joint cross-entropy over orientations and pixels, as in the Transporter.
 
     Args:
         logits: (orientations, rows, cols).

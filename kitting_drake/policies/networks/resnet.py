@@ -124,7 +124,7 @@ class ResNet(MixedPrecision):
 
 
 def _stage(channels_in: int, channels: int, *, stride: int = 1) -> nn.Sequential:
-    """A stage of two blocks, of which the first has the stride."""
+    """Makes a stage of two blocks. Only the first block has the stride."""
     return nn.Sequential(
         Bottleneck(channels_in, channels, channels, stride=stride),
         nn.ReLU(inplace=True),

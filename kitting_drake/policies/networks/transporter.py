@@ -83,13 +83,14 @@ class TransporterNetworks(Networks):
             raise ValueError(f"orientations must be an even number, not {orientations}")
 
     def pick_volume(self, image: Image, orientations: int) -> Tensor:
-        """f_pick: (N / 2, rows, cols), the logits of all pixels at gripper angles 2 pi i / N."""
+        """Returns f_pick, (N / 2, rows, cols): the logits of all pixels at the gripper angles
+        2 pi i / N."""
         self.check_orientations(orientations)
         step = math.tau / orientations
         return torch.stack([self._pick_scores(image, i * step) for i in range(orientations // 2)])
 
     def _pick_scores(self, image: Image, theta: float) -> Tensor:
-        """(rows, cols): the logits of picking with the gripper at angle `theta`."""
+        """Returns the logits (rows, cols) of picking with the gripper at the angle `theta`."""
         rows, cols = image.shape[1:]
         canvas = canvas_shape((rows, cols), theta)
         scene = rotated(self._on_device(image), -theta, canvas)
@@ -143,7 +144,8 @@ class TransporterNetworks(Networks):
 
     @property
     def _pick_rotations(self) -> int | None:
-        """Half of `rotations`, because a gripper has half as many distinct angles."""
+        """Half of `rotations`, because a gripper has only half as many distinct angles as a
+        crop."""
         return None if self.rotations is None else self.rotations // 2
 
     def _drawn_scores(self, image: Image, drawn: dict[int, float]) -> Tensor:
@@ -154,12 +156,12 @@ class TransporterNetworks(Networks):
         return torch.stack(scores)
 
     def encode_crops(self, image: Image, pixel: tuple[int, int], angles: Sequence[float]) -> Tensor:
-        """The kernels of f_place: psi of crops around a pixel of the rotated scene.
+        """Returns the kernels of f_place: psi's encodings of crops of the rotated scene.
 
         Args:
             image: the observation.
-            pixel: (row, col).
-            angles: n rotations of the scene about that pixel, in radians.
+            pixel: (row, col) of the centre of all crops and rotations.
+            angles: n rotations of the scene about `pixel`, in radians.
 
         Returns:
             (n, channels, KERNEL, KERNEL).
@@ -174,9 +176,9 @@ class TransporterNetworks(Networks):
     ) -> PlacePrediction:
         """Predicts f_place over all pixels and, for N up to 36, at all rotations.
 
-        For larger N, 36 nearly evenly spaced rotations are evaluated first. Then, for each of the
-        three best peaks, all bins between the neighbouring rotations are encoded and correlated at
-        pixels near the peak.
+        For larger N, 36 nearly evenly spaced rotations are evaluated first. Then, around each of
+        the three best peaks, all bins from the previous to the next of the 36 rotations are
+        evaluated at the pixels near the peak.
         """
         shape = (image.shape[1], image.shape[2])
         step = math.tau / orientations
@@ -200,7 +202,7 @@ class TransporterNetworks(Networks):
         return PlacePrediction(ranked(candidates, orientations), volume.amax(0))
 
     def place_loss(self, sample: LabelledImage, pixel: tuple[int, int], seed: int) -> Tensor:
-        """Cross-entropy over all pixels and sampled rotations (see `draw_bins`)."""
+        """Returns the cross-entropy over all pixels and the drawn rotations (see `draw_bins`)."""
         orientations = self.config.orientations
         step = math.tau / orientations
         row, col = sample.place_of(np.array(pixel, float))
@@ -218,13 +220,13 @@ class TransporterNetworks(Networks):
 
 
 def coarse_bins(orientations: int) -> list[int]:
-    """The crop rotations that are encoded first at inference, in bins; at most 36."""
+    """Returns the crop rotations that are encoded first at inference, in bins; at most 36."""
     count = min(orientations, _COARSE)
     return [round(i * orientations / count) for i in range(count)]
 
 
 def encodings_per_decision(orientations: int) -> int:
-    """The number of crops that `TransporterNetworks.predict_place` encodes at N."""
+    """Returns the number of crops that `TransporterNetworks.predict_place` encodes at N."""
     coarse = len(coarse_bins(orientations))
     if coarse == orientations:
         return coarse
@@ -244,8 +246,8 @@ def draw_bins(
 
     Args:
         labels: bins that must be included.
-        bins: the total number of bins, over half a rotation or a full one.
-        step: the angle between neighbours, in radians.
+        bins: the total number of bins, over half a rotation or a full rotation.
+        step: the angle between neighbouring bins, in radians.
         random: the generator that draws the other bins.
         rotations: the number of bins to return, including the labels. Half of the drawn bins are
             near a label, if there are enough. None draws the minimum of two bins per stratum.
@@ -281,7 +283,8 @@ def among(label: list[tuple[int, float]], drawn: dict[int, float]) -> list[tuple
 
 
 def canvas_shape(shape: tuple[int, int], angle: float) -> tuple[int, int]:
-    """Rows and cols that hold all pixel centres of a rotated image of the given shape."""
+    """Returns the rows and cols that hold all pixel centres of an image (rows, cols) after its
+    rotation by an angle in radians."""
     cos, sin = abs(math.cos(angle)), abs(math.sin(angle))
     height, width = shape[0] - 1, shape[1] - 1
     # Subtract a little, so that rounding errors do not add a pixel at a rotation by 90 degrees.
@@ -307,7 +310,7 @@ def rotated(image: Tensor, angle: float, shape: tuple[int, int]) -> Tensor:
 
 
 def rotated_crops(image: Tensor, pixel: tuple[int, int], angles: Sequence[float]) -> Tensor:
-    """Crops of the scene rotated about a pixel, which is the centre of each crop.
+    """Returns crops of the scene after rotations about a pixel, which is the centre of each crop.
 
     Rotating the scene rather than the crop keeps the crop's corners filled.
 
@@ -325,7 +328,11 @@ def rotated_crops(image: Tensor, pixel: tuple[int, int], angles: Sequence[float]
 def _sampled(
     image: Tensor, centre: tuple[float, float], angles: Sequence[float], shape: tuple[int, int]
 ) -> Tensor:
-    """Rotates an image about a point by each angle. That point is the centre of the results."""
+    """Rotates an image about the point `centre` (row, col) by each of n angles, in radians.
+
+    Returns:
+        (n, channels, *shape). The point lies at the centre of each result.
+    """
     axes = [
         torch.arange(side, dtype=image.dtype, device=image.device) - (side - 1) / 2
         for side in shape

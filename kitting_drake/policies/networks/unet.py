@@ -60,7 +60,7 @@ class ResidualBlock(nn.Module):
         )
 
     def forward(self, features: Tensor) -> Tensor:
-        """Maps (batch, channels, rows, cols) to the same rows and cols."""
+        """Maps (batch, channels in, rows, cols) to (batch, channels out, rows, cols)."""
         hidden = self.second(F.elu_(self.first(features)))
         return F.elu_(hidden + self.shortcut(features))
 

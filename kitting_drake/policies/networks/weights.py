@@ -1,9 +1,9 @@
 """Reads and writes trained networks as safetensors files. Loaded networks have plain convolutions
 and need no group library.
 
-A file holds the trained weights, which are coefficients in bases of kernels, and the few bases. The
-plain kernels are expanded from both when the file is loaded. Storing the kernels themselves would
-take ten times the space (37 MB instead of 4 MB for the preset "small").
+A file holds a few bases of kernels, and the trained weights, which are coefficients in these bases.
+The plain kernels are computed from them when the file is loaded. The kernels themselves would take
+ten times the space (37 MB instead of 4 MB for the preset "small").
 """
 
 from __future__ import annotations
@@ -55,8 +55,8 @@ class WeightsFile:
 
 
 def card_seeds(card: Mapping[str, Any]) -> set[int]:
-    """The seeds of all demonstrations for training and validation, including those of the weights
-    that training started from."""
+    """Returns the seeds of all demonstrations for training and validation. If training started from
+    other weights, their seeds are included."""
     seeds = set(card.get("start_seeds", ()))
     # Seeds of static scenes are not seeds of episodes.
     if card.get("scenario") != STATIC:
@@ -65,8 +65,8 @@ def card_seeds(card: Mapping[str, Any]) -> set[int]:
 
 
 def learned_seeds(card: Mapping[str, Any]) -> dict[str, list[int]]:
-    """The seeds of the training demonstrations by scenario, including those of all weights that
-    training started from."""
+    """Returns the seeds of the training demonstrations by scenario. If training started from other
+    weights, their seeds are included."""
     learned = {scenario: set(seeds) for scenario, seeds in card.get("start_learned", {}).items()}
     own = set(card.get("demonstration_seeds", ()))
     scenario = str(card.get("scenario"))
@@ -134,7 +134,7 @@ def read_weights_file(path: Path) -> WeightsFile:
 
 
 def load_networks(path: Path, compute_type: torch.dtype = torch.float32) -> Networks:
-    """Networks of plain convolutions for inference.
+    """Loads networks for inference, with plain convolutions.
 
     Args:
         path: a file that `save_weights` wrote.
@@ -151,7 +151,7 @@ def load_networks(path: Path, compute_type: torch.dtype = torch.float32) -> Netw
     try:
         networks = make_networks(config, PlainConv2d)
     except (TypeError, ValueError) as error:
-        raise UserError(f"{path}: its config is unusable: {error}") from error
+        raise _unusable(path, error) from error
     try:
         networks.load_state_dict(state)
     except RuntimeError as error:
@@ -170,21 +170,21 @@ def load_networks(path: Path, compute_type: torch.dtype = torch.float32) -> Netw
 def load_trainable(
     path: Path, fresh_angle_at: int | None = None, preset: str | None = None
 ) -> Networks:
-    """Trainable networks that continue from a file's weights.
+    """Loads trainable networks with a file's weights.
 
-    The file does not hold the optimisers' state, so they start afresh.
+    The file does not hold the optimisers' state.
 
     Args:
         path: a file that `save_weights` wrote.
-        fresh_angle_at: number of orientations N of the result. Its pick-angle network then has
+        fresh_angle_at: the number of orientations N of the result. The pick-angle network then gets
             untrained weights, because its architecture may depend on N. None keeps the file's N and
             all its weights.
-        preset: the preset of the result. Its U-nets must have the same size
-            (`NetworkConfig.has_unets_of`). None keeps the file's.
+        preset: the preset of the result, used only with `fresh_angle_at`. Its U-nets must have the
+            same sizes as the file's (`NetworkConfig.has_unets_of`). None keeps the file's preset.
 
     Raises:
         UserError: the file is unusable, see `load_networks`.
-        ValueError: the networks do not support that N.
+        ValueError: the networks do not support N orientations.
     """
     plain = load_networks(path)
     config = plain.config
@@ -217,7 +217,8 @@ def load_trainable(
 def _plain_state(
     path: Path, tensors: dict[str, Tensor], bases: dict[str, Any]
 ) -> dict[str, Tensor]:
-    """The state dict of networks of plain convolutions, with kernels expanded from their bases."""
+    """Returns the state dict of networks with plain convolutions, whose kernels are expanded from
+    their bases."""
     state = {}
     for name, tensor in tensors.items():
         layer, _, kind = name.rpartition(".")
@@ -250,7 +251,7 @@ def _read(path: Path, *, tensors: bool) -> tuple[dict[str, str], dict[str, Tenso
     if metadata.get("format_version") != str(FORMAT_VERSION):
         raise UserError(
             f"{path} has format version {metadata.get('format_version')}, but this version of "
-            f"kitting_drake reads {FORMAT_VERSION}"
+            f"kitting_drake reads version {FORMAT_VERSION}: use the version that wrote it"
         )
     return metadata, content
 
@@ -276,7 +277,12 @@ def _config(path: Path, metadata: dict[str, str]) -> NetworkConfig:
         values["angle_frequencies"] = tuple(values["angle_frequencies"])
         return NetworkConfig(**values)
     except (TypeError, ValueError) as error:
-        raise UserError(f"{path}: its config is unusable: {error}") from error
+        raise _unusable(path, error) from error
+
+
+def _unusable(path: Path, error: Exception) -> UserError:
+    reason = error if isinstance(error, ValueError) else "one of its fields has the wrong type"
+    return UserError(f"{path}: its config cannot be used: {reason}")
 
 
 def _stop_threshold(path: Path, metadata: dict[str, str]) -> float | None:

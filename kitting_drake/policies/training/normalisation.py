@@ -25,7 +25,7 @@ def normalisation(observed: list[ObservedScene]) -> dict[str, float]:
 
 
 def _moments(values: NDArray[np.float32]) -> tuple[float, float]:
-    """The mean of some values and the mean of their squares."""
+    """Returns the mean of some values and the mean of their squares."""
     return float(values.mean(dtype=float)), float(np.square(values, dtype=float).mean())
 
 

@@ -56,8 +56,9 @@ def export_onnx(weights: Path, folder: Path) -> list[Path]:
     """Writes the networks of a weights file as ONNX in float32, and `policy.json`.
 
     Each graph maps `image`, prepared as `policy.json` describes, to `output`. The U-nets alpha, phi
-    and psi take any sides that are one more than a multiple of 16 pixels; beta takes its crop.
-    Crops, rotations and correlation are not exported (see docs/learning.md).
+    and psi take any sides that are one more than a multiple of 16 pixels; beta takes a crop with
+    sides of `PICK_CROP` pixels. Making crops, rotating them and correlating them is not exported
+    (see docs/learning.md).
 
     Args:
         weights: a file that `train` wrote.
@@ -67,15 +68,15 @@ def export_onnx(weights: Path, folder: Path) -> list[Path]:
         The paths of the files.
 
     Raises:
-        UserError: the weights are unusable or those of a Transporter, which rotates images between
-            its networks, or the package onnx is not installed.
+        UserError: the weights are unusable, they are those of a Transporter, or the package onnx is
+            not installed.
     """
     networks = load_networks(weights)
     card = read_weights_file(weights).card
     if not isinstance(networks, FactoredNetworks):
         raise UserError(
             f"{weights}: a {networks.config.method} cannot be exported as ONNX, because it rotates "
-            "images between its networks"
+            "images between its networks: give weights of another method"
         )
     onnx = require_onnx()
     require_folder(folder)

@@ -39,11 +39,11 @@ from kitting_drake.policies.training.validation import mean_loss, validate
 WEIGHTS = "policy.safetensors"
 """The file of the best weights, in the folder of a training run."""
 _CHECKPOINT_EVERY = 100
-"""Number of steps between checkpoints, and between points of the logged curves."""
+"""The number of steps between checkpoints, and between points of the logged curves."""
 _MOST_VALIDATED = 64
-"""A validation uses at most this many scenes, and at most this many final observations."""
+"""The largest number of scenes, and of final observations, in a validation."""
 _MOST_NORMALISED = 512
-"""The normalisation is computed from at most this many scenes."""
+"""The largest number of scenes from which the normalisation is computed."""
 _DAMAGED = (
     OSError,
     EOFError,
@@ -90,7 +90,7 @@ class Settings:
     angle_only: bool
     """Whether only the pick-angle network is trained, from untrained weights."""
     start: str | None
-    """A digest of the weights that training starts from; None for untrained ones."""
+    """A digest of the weights from which training starts; None for untrained weights."""
     start_seeds: tuple[int, ...]
     """All demonstration seeds of the starting weights (see `card_seeds`)."""
     start_learned: dict[str, list[int]]
@@ -99,8 +99,9 @@ class Settings:
     compute_type: str
 
 
-def _begun(settings: Settings, learned: TrainingData, start: Path | None) -> Networks:
-    """Makes the networks before the first step, with untrained weights or with those of a file."""
+def _initial_networks(settings: Settings, learned: TrainingData, start: Path | None) -> Networks:
+    """Makes the networks before the first step, with the weights of the file `start` or, if it is
+    None, with untrained weights."""
     torch.manual_seed(settings.seed)
     try:
         if start is not None:
@@ -138,10 +139,10 @@ class TrainingRun:
         Args:
             settings: the settings of the run.
             learned: the training data.
-            held_out: the validation data, which decide which checkpoint is kept.
+            held_out: the validation data, by which the best weights are chosen.
             folder: the folder of the run's files.
             console: where to show progress.
-            start: weights to start from; None for untrained ones.
+            start: the file of the weights from which to start; None for untrained weights.
 
         Raises:
             UserError: the settings do not fit the networks, or the weights are unusable.
@@ -158,7 +159,7 @@ class TrainingRun:
             samples = held_out.samples(taken_only=True, colour=settings.colour)
             chosen = evenly_chosen(list(range(len(samples))), _MOST_VALIDATED)
             self._judged = [samples[index] for index in chosen]
-        networks = _begun(settings, learned, start)
+        networks = _initial_networks(settings, learned, start)
         networks.to(settings.device)
         networks.compute_type = preferred_type()
         networks.rotations = settings.rotations
@@ -291,7 +292,9 @@ class TrainingRun:
                 state[key] for key in ("best", "seconds", "recent")
             )
         except _DAMAGED as error:
-            raise UserError(f"cannot resume from {path}: delete {self.folder}") from error
+            raise UserError(
+                f"cannot resume from {path}, which is damaged: delete {self.folder} to start afresh"
+            ) from error
         kept = [line for line in read_lines(self._log) if line["step"] <= self.trainer.step_count]
         write_atomically(self._log, "".join(json.dumps(line) + "\n" for line in kept))
 

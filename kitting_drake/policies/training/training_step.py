@@ -50,18 +50,18 @@ class _Prepared:
 
 
 def decayed(step: int, steps: int) -> float:
-    """The factor of the learning rate at a step: a linear warm-up over a hundred steps times a
-    cosine decay to zero over all steps."""
+    """Returns the factor of the learning rate at a step. It is a linear warm-up over a hundred
+    steps, times a cosine decay to zero over all steps."""
     rise = min(1.0, (step + 1) / 100)
     return rise * 0.5 * (1 + math.cos(math.pi * min(1.0, step / steps)))
 
 
 class Trainer:
-    """Networks and their optimisers, one Adam per loss.
+    """Trains networks. Each loss has its own Adam optimiser.
 
     All random draws of a step depend only on the seed and the step's number, so a resumed run
-    continues exactly. A thread prepares the samples of the next step. The processes of torch's
-    DataLoader could not receive them, because they refer to an open HDF5 file.
+    continues exactly. A thread prepares the samples of the next step. It is not a process of
+    torch's DataLoader, because the samples refer to an open HDF5 file.
     """
 
     def __init__(
@@ -115,7 +115,7 @@ class Trainer:
         self._schedules = self._scheduled()
 
     def _scheduled(self) -> list[LambdaLR]:
-        """The learning rate schedules of the optimisers, at the current step."""
+        """Makes the learning rate schedules of the optimisers, at the current step."""
         for optimiser in self.optimisers.values():
             for group in optimiser.param_groups:
                 group["initial_lr"] = self.learning_rate
@@ -133,9 +133,8 @@ class Trainer:
     ) -> dict[str, float]:
         """Executes one training step on random, augmented samples.
 
-        With one of eight samples, on average, networks that can stop also learn from a final
-        observation. Its loss is added to that of the picking module. The other modules are not
-        affected.
+        With one of eight samples, on average, networks with a stop class also learn from a final
+        observation. Its loss is added to the loss of the picking module.
 
         Args:
             samples: labelled observations in which something is left to pick.
@@ -160,7 +159,7 @@ class Trainer:
         return {name: sum(values) / len(values) for name, values in found.items()}
 
     def _learn(self, draw: _Draw) -> Iterator[tuple[str, float]]:
-        """Adds the gradients of a sample's losses; yields each loss."""
+        """Computes the gradients of a sample's losses. Yields the name and value of each loss."""
         for name, loss_of in self.networks.losses(draw.sample, draw.random):
             if name not in self.optimisers:
                 continue
@@ -211,13 +210,13 @@ class Trainer:
         return _Draw(sample, random, self._draw_final(finals, stop_random), stop_random)
 
     def _draw_final(self, finals: Sequence[Pictured], random: np.random.Generator) -> Image | None:
-        """A randomly moved final observation, or None in most steps."""
+        """Returns a randomly moved final observation; in most steps None."""
         if not (self.networks.config.stop and finals) or random.random() >= _STOP_PROBABILITY:
             return None
         return Motion.draw(finals[int(random.integers(len(finals)))].image, random).moved_image()
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that `load_state_dict` needs to continue exactly."""
+        """Returns everything that `load_state_dict` needs to continue exactly."""
         return {
             "step_count": self.step_count,
             "networks": self.networks.state_dict(),

@@ -21,15 +21,16 @@ ERRORS = ("pick_mm", "pick_deg", "place_mm", "rotation_deg", "displacement_mm")
 _ARM = 50.0
 """The mean distance of a tool's points from its grasp, in mm; converts angles to displacements."""
 _LOST = 20.0
-"""Displacements are clipped to this, in mm, because an object that is farther off counts as
-lost."""
+"""The displacement, in mm, from which on an object counts as lost. Larger ones are clipped."""
 
 
 def prediction_errors(
     decision: Decision, targets: Sequence[LabelledImage], millimetres: float
 ) -> NDArray[np.float64]:
-    """Errors of a prediction relative to the target with the nearest pick. A decision to stop is
-    ignored.
+    """Returns the errors of a prediction, relative to the target with the nearest pick.
+
+    If the policy decided to stop, the errors are those of the action that it predicted
+    nevertheless.
 
     Args:
         decision: the prediction.
@@ -79,9 +80,9 @@ def choose_stop_threshold(present: ArrayLike, absent: ArrayLike) -> float | None
 
     Returns:
         The threshold with the fewest wrong decisions; None if `present` or `absent` is empty. It
-        lies a quarter of the way from the next lower to the next higher log-odds. If several
-        thresholds have equally few wrong decisions, it is the lowest, because an unneeded action
-        costs less than a forgotten object.
+            lies a quarter of the way from the log-odds just below it to those just above it. If
+            several thresholds have equally few wrong decisions, it is the lowest, because an
+            unneeded action does less harm than a forgotten object.
     """
     present, absent = np.sort(np.asarray(present, float)), np.sort(np.asarray(absent, float))
     if not len(present) or not len(absent):
@@ -107,16 +108,15 @@ def validate(
     Returns:
         - `median_...` and `p95_...` for each of `ERRORS`: its median and 95th percentile;
         - `displacement_mm`: the mean displacement;
-        - `cost_mm`, by which a checkpoint is chosen if the expert's action is the only right one:
-          the mean displacement over all scenes and final observations. A wrong decision to stop or
-          to go on counts 20 mm, and a right one on a final observation counts 0.
+        - `cost_mm`: the mean displacement over all scenes and final observations, where a wrong
+          decision to stop or to go on counts as 20 mm, and a right decision to stop as 0.
 
-        With final observations also:
+        If there are final observations, also:
 
-        - `stop_threshold`: the threshold chosen for them;
-        - `stop_margin`: the gap between the log-odds of both kinds in nats, negative if they
-          overlap;
-        - `false_stops` and `missed_stops`: the numbers of wrong decisions.
+        - `stop_threshold`: the threshold of `choose_stop_threshold`;
+        - `stop_margin`: the least log-odds of a scene minus the largest of a final observation, in
+          nats;
+        - `false_stops` and `missed_stops`: the numbers of wrong decisions to stop and to go on.
     """
     errors, present = [], []
     for scene in scenes:
@@ -141,7 +141,7 @@ def validate(
 
 @torch.no_grad()
 def mean_loss(networks: Networks, samples: Sequence[LabelledImage]) -> float:
-    """The mean over samples of the sum of all losses, in nats.
+    """Returns the mean, over samples, of the sum of all losses, in nats.
 
     Args:
         networks: the networks of any method, for inference.
@@ -157,7 +157,7 @@ def mean_loss(networks: Networks, samples: Sequence[LabelledImage]) -> float:
 def _stop_report(
     present: NDArray[np.float64], absent: NDArray[np.float64], displacements: NDArray[np.float64]
 ) -> dict[str, float]:
-    """The part of `validate`'s report about stopping.
+    """Returns the part of `validate`'s report about stopping.
 
     Args:
         present: the log-odds of scenes with something to pick.

@@ -27,7 +27,7 @@ KERNEL = 65
 COARSE_ROTATIONS = 48
 """The number of rotations of the coarse volume."""
 _REACH = 4
-"""The full correlation is evaluated up to this far from a coarse cell's pixel, in pixels."""
+"""How far around the pixel of a coarse cell the full correlation is evaluated, in pixels."""
 
 
 def lift(encoding: Tensor, angles: Tensor, size: int) -> Tensor:
@@ -100,7 +100,7 @@ class _FourierCorrelation(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:
-        """The gradients with respect to the scene and the kernels."""
+        """Returns the gradients with respect to the scene and the kernels."""
         conjugate, spectra = ctx.saved_tensors
         shape, scene_shape, kernel_shape = ctx.shapes
         spectrum = _spectrum(gradient, shape)
@@ -115,7 +115,7 @@ class _FourierCorrelation(torch.autograd.Function):
 
 
 def _spectrum(signals: Tensor, shape: tuple[int, int]) -> Tensor:
-    """The transposed `torch.fft.rfft2` of signals that are zero-padded to a shape."""
+    """Returns the transposed `torch.fft.rfft2` of signals that are zero-padded to a shape."""
     along_rows = torch.fft.rfft(signals, n=shape[1]).mT
     # Because of the transpose each transform reads and writes contiguous memory.
     return torch.fft.fft(F.pad(along_rows, (0, shape[0] - signals.shape[-2])))
@@ -136,7 +136,7 @@ def _first_lags(spectra: Tensor, shape: tuple[int, int], lags: tuple[int, int]) 
 
 
 def rotation_angles(count: int, like: Tensor, phase: float = 0.0) -> Tensor:
-    """(count,): evenly spaced angles over a full rotation, in radians.
+    """Returns evenly spaced angles (count,) over a full rotation, in radians.
 
     Args:
         count: the number of angles.
@@ -151,7 +151,7 @@ _halve = BlurPool()
 
 
 def coarse_volume(scene: Tensor, encoding: Tensor, angles: Tensor) -> Tensor:
-    """The correlation at half the resolution, scaled so that it approximates the full correlation.
+    """Computes the correlation at half the resolution, scaled to approximate the full correlation.
 
     Args:
         scene: (1, channels, rows, cols) with odd sides.
@@ -169,7 +169,7 @@ def coarse_volume(scene: Tensor, encoding: Tensor, angles: Tensor) -> Tensor:
 def window(
     scene: Tensor, encoding: Tensor, angles: Tensor, corner: tuple[int, int], shape: tuple[int, int]
 ) -> Tensor:
-    """A window of the full correlation with the rotated encoding of a crop.
+    """Computes a window of the full correlation with the rotated encoding of a crop.
 
     Args:
         scene: (1, channels, rows, cols).
@@ -187,7 +187,7 @@ def window(
 def kernel_window(
     scene: Tensor, kernels: Tensor, corner: tuple[int, int], shape: tuple[int, int]
 ) -> Tensor:
-    """A window of the full correlation with given kernels.
+    """Computes a window of the full correlation with given kernels.
 
     Args:
         scene: (1, channels, rows, cols).
@@ -238,13 +238,13 @@ class Candidate:
     """The pixel (row, col) of `scores[:, 0, 0]`; all pixels lie in the scene."""
 
     def best(self) -> tuple[float, int, int, int]:
-        """The largest score with its position, as (score, rotation bin, row, col)."""
+        """Returns the largest score with its position, as (score, rotation bin, row, col)."""
         rotation, row, col = _argmax(self.scores)
         score = float(self.scores[rotation, row, col])
         return score, self.first_bin + rotation, self.corner[0] + row, self.corner[1] + col
 
     def known_neighbours(self) -> int:
-        """How many cells of the block of 27 around the maximum lie within the window."""
+        """Returns how many of the 3 x 3 x 3 cells around the maximum lie within the window."""
         at = _argmax(self.scores)
         return math.prod(
             min(i + 2, n) - max(i - 1, 0) for i, n in zip(at, self.scores.shape, strict=True)
@@ -297,10 +297,11 @@ def peaks(volume: Tensor, count: int) -> Iterator[tuple[int, int, int]]:
 
 
 def finer_bins(rotation: int, coarse: int, orientations: int) -> tuple[int, int]:
-    """The first and last of the N bins between the neighbours of a coarse rotation.
+    """Returns the first and the last of the N bins between the coarse rotations before and after a
+    given coarse rotation.
 
     Args:
-        rotation: the coarse rotation, in coarse bins.
+        rotation: the given rotation, in coarse bins.
         coarse: the number of coarse bins over a full rotation.
         orientations: N, the number of orientations.
     """
@@ -311,8 +312,8 @@ def finer_bins(rotation: int, coarse: int, orientations: int) -> tuple[int, int]
 def window_around(
     pixel: tuple[int, int], shape: tuple[int, int]
 ) -> tuple[tuple[int, int], tuple[int, int]]:
-    """The corner (row, col) and shape (rows, cols) of the window around a pixel, clipped to an
-    image.
+    """Returns the corner (row, col) and shape (rows, cols) of the window around a pixel, clipped to
+    the image.
 
     Args:
         pixel: (row, col).
@@ -331,17 +332,18 @@ def search(
     shape: tuple[int, int] | None = None,
     candidates: int = 6,
 ) -> tuple[list[Candidate], Tensor]:
-    """The peaks of the full correlation at N orientations, best first, and the coarse volume.
+    """Finds the peaks of the full correlation at N orientations.
 
     Args:
         scene: (1, channels, rows, cols), odd sides, phi(o_t).
         encoding: (1, channels, side, side), psi(c).
         orientations: N, the number of orientations.
-        shape: searches only the first rows and cols; all by default.
+        shape: how many rows and cols of the scene to search; all by default.
         candidates: the number of coarse peaks to refine.
 
     Returns:
-        The candidates, and the coarse volume (COARSE_ROTATIONS, about rows / 2, about cols / 2).
+        Windows around the peaks, best first, and the coarse volume (COARSE_ROTATIONS, about
+            rows / 2, about cols / 2).
     """
     rows, cols = shape or scene.shape[-2:]
     volume = coarse_volume(scene, encoding, rotation_angles(COARSE_ROTATIONS, scene))

@@ -19,8 +19,8 @@ from kitting_drake.policies.networks.layers.fibres import fourier_basis
 def discretization_matrix(
     orientations: int, frequencies: Sequence[int], *, quotient: int = 1
 ) -> NDArray[np.float64]:
-    """The matrix Q of the paper, which discretizes a function on SO(2), or on a quotient of it, to
-    N angles (equations 5 and 6).
+    """Returns the matrix Q of the paper, which discretizes a function on SO(2), or on a quotient of
+    it, to N angles (equations 5 and 6).
 
     Args:
         orientations: N, the number of bins over a full rotation.

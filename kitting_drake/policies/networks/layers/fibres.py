@@ -135,7 +135,7 @@ class Regular:
 
 
 def fourier_basis(angles: NDArray[np.float64], frequencies: Sequence[int]) -> NDArray[np.float64]:
-    """The basis of equation 5 at given angles.
+    """Returns the basis of equation 5 at given angles.
 
     Args:
         angles: (n,), in radians.

@@ -13,15 +13,15 @@ from kitting_drake.policies.networks.layers.fibres import fourier_basis
 
 
 def series_maximum(coefficients: NDArray[np.float64], frequencies: Sequence[int]) -> float:
-    """The angle at which a Fourier series is largest, without discretization.
+    """Returns the angle at which a Fourier series is largest, without discretization.
 
     Args:
         coefficients: (d,), in the order of `fourier_basis`.
         frequencies: the frequencies of the series, ascending.
 
     Returns:
-        The angle in [0, 2 pi), in radians. A series on a quotient has several equal maxima; this is
-        the first.
+        The angle in [0, 2 pi), in radians. A series on a quotient has several equal maxima, of
+            which the first is returned.
     """
     # On a quotient the period is shorter, so search only one period.
     period = math.gcd(*frequencies) or 1
@@ -59,7 +59,7 @@ def series_maximum(coefficients: NDArray[np.float64], frequencies: Sequence[int]
 def _complex_weights(
     coefficients: NDArray[np.float64], frequencies: Sequence[int]
 ) -> NDArray[np.complex128]:
-    """The weights w_j with which the series is the sum over j of Re(w_j exp(i j angle))."""
+    """Returns the weights w_j with which the series is the sum over j of Re(w_j exp(i j angle))."""
     weights = np.zeros(len(frequencies), complex)
     index = 0
     for position, j in enumerate(frequencies):

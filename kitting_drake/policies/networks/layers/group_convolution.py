@@ -4,10 +4,10 @@ Between regular fields of C_N, or of C_N / C_q, with M = N / q channels, every s
 
     K[m, n](x) = kappa[(n - m) mod M](R_m^-1 x),
 
-where R_m is the rotation by 2 pi m / N. The kernels to output channel 0 are free, and those to
-channel m are their rotated copies. escnn spans the same space, but its basis of M B kernels, each
-with M^2 numbers per pixel, does not fit into memory at N = 180. This layer stores only B patterns
-in M rotations.
+where R_m is the rotation by 2 pi m / N. The kernels to output channel 0 can be chosen freely, and
+those to channel m are their rotated copies. escnn spans the same space, but its basis of M B
+kernels, each with M^2 numbers per pixel, does not fit into memory at N = 180. This layer stores
+only B patterns in M rotations.
 """
 
 from __future__ import annotations
@@ -69,7 +69,8 @@ class GroupConv2d(ExpandedConv2d):
 
 @functools.lru_cache(maxsize=16)
 def rotated_patterns(fibre: Regular, size: int) -> Tensor:
-    """escnn's circular harmonics that are invariant under C_q, in all rotations of C_N / C_q.
+    """Returns escnn's circular harmonics that are invariant under C_q, in all rotations of
+    C_N / C_q.
 
     Args:
         fibre: the regular representation of C_N / C_q.

@@ -15,7 +15,7 @@ _MODULE = "lie_learn.representations.SO3.wigner_d"
 
 
 def _stand_in() -> types.ModuleType:
-    """The stub for the module that escnn imports."""
+    """Makes the stub of the module that escnn imports."""
 
     def wigner_d_matrix(*args: object, **options: object) -> None:
         raise NotImplementedError(

@@ -75,12 +75,12 @@ class ExpandedConv2d(nn.Module):
         self.register_buffer("basis", basis, persistent=False)
 
     def _make_basis(self, in_fields: int, size: int) -> tuple[Tensor, int, float]:
-        """The basis, the number of weights between two fields, and their initial standard deviation
-        (He initialisation)."""
+        """Returns the basis, the number of weights between two fields, and the initial standard
+        deviation of the weights (He initialisation)."""
         raise NotImplementedError
 
     def kernel(self, dtype: torch.dtype = torch.float32) -> Tensor:
-        """The expanded kernel (out channels, in channels, size, size), in the memory format
+        """Returns the expanded kernel (out channels, in channels, size, size), in the memory format
         channels_last."""
         raise NotImplementedError
 
@@ -93,7 +93,7 @@ class ExpandedConv2d(nn.Module):
         raise NotImplementedError
 
     def channel_bias(self) -> Tensor | None:
-        """(out channels,) bias of each channel; None if the layer has no bias."""
+        """Returns the bias (out channels,) of each channel; None if the layer has no bias."""
         return None if self.bias is None else self.bias.repeat_interleave(self.out_fibre.channels)
 
     def forward(self, features: Tensor) -> Tensor:
@@ -193,10 +193,12 @@ class PlainConv2d(nn.Conv2d):
 def _shared_basis(
     in_fibre: Fibre, out_fibre: Fibre, size: int, dtype: torch.dtype
 ) -> tuple[Tensor, float]:
-    """Returns the basis of all layers between two fibres, and the sum of its squares.
+    """Makes the basis that all layers between two fibres share.
 
     Returns:
-        (D, out channels, in channels, size, size), in the memory order that `expand_kernel` needs.
+        (D, out channels, in channels, size, size): the basis, in the memory order that
+            `expand_kernel` needs.
+        The sum of the squares of the basis's entries.
     """
     basis = kernel_basis(in_fibre, out_fibre, size)
     order = basis.permute(0, 1, 3, 4, 2).to(dtype).contiguous()
@@ -207,8 +209,8 @@ def _shared_basis(
 # escnn caches tensors, which must also work outside inference mode, so switch it off here.
 @torch.inference_mode(False)
 def kernel_basis(in_fibre: Fibre, out_fibre: Fibre, size: int) -> Tensor:
-    """escnn's basis of the steerable kernels between two fibres, with the Fourier transforms folded
-    in.
+    """Returns escnn's basis of the steerable kernels between two fibres, with the Fourier
+    transforms folded in.
 
     Returns:
         (D, out channels, in channels, size, size), float64.
@@ -257,14 +259,14 @@ def kernel_basis(in_fibre: Fibre, out_fibre: Fibre, size: int) -> Tensor:
 
 
 def frequencies_cutoff(in_fibre: Fibre, out_fibre: Fibre, size: int) -> float | None:
-    """The largest angular frequency of the kernels on a ring of pixels, per pixel of its radius.
+    """Returns the largest angular frequency of kernels on a ring of pixels, per pixel of radius.
 
     A kernel of angular frequency k maps rho_i to rho_j with j up to i + k. With escnn's own limit,
     the highest output frequencies may be unreachable and so always zero. The limit is then raised
     to the value that they need on the outermost ring. Higher frequencies would alias there.
 
     Returns:
-        The limit; None for escnn's own.
+        The limit; None for escnn's own limit.
     """
     if not (isinstance(in_fibre, Irreps) and isinstance(out_fibre, Irreps)):
         return None
@@ -321,7 +323,7 @@ class InvariantPart(nn.Module):
 
 
 def _of_several_fields(matrix: NDArray[np.float64], fields: int) -> Tensor:
-    """The block-diagonal matrix that applies a matrix to each of several fields.
+    """Returns the block-diagonal matrix that applies a matrix to each of several fields.
 
     It combines about 64 channels. Although most of its entries are zero, one such product takes
     half as long as several products with eight channels each.
