@@ -38,8 +38,8 @@ class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
     - Observation and action: see `gym.spaces`. The observation is o_t at the time when a policy
       would be called, while the hand waits out of the cameras' sight.
     - Reward: the increase of the task's reward, so that the return equals `success_rate` in
-      `results.json`. If the episode times out or fails, both are 0: the last step subtracts the
-      reward earned before.
+      `results.json`. If the episode times out or fails, the last step subtracts the reward earned
+      before, so that the return is 0, as is `success_rate`.
     - Terminated: the agent stopped, or every goal is filled. Truncated: no actions or no time are
       left, or the simulation failed (`info["failure"]`).
     - `info`: the present values of the keys of `results.json`, without `wall_seconds`, which would
@@ -65,7 +65,7 @@ class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         """
         Args:
             scenario: a scenario file, or the name of one of the project's; its policy is ignored.
-            scenario_name: name of a scenario in the file; None for the first.
+            scenario_name: the name of a scenario in the file; None for the first.
             scenario_text: YAML that is merged over the scenario.
             perturb: perturbations, as for `--perturb`.
             cameras: whether observations also contain the cameras' images.
@@ -175,7 +175,7 @@ class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         return self._observe(), reward, terminated, truncated, self._info(result)
 
     def render(self) -> NDArray[np.uint8] | None:
-        """(800, 1280, 3) picture of the whole cell at present; None without a render mode.
+        """Returns a picture (800, 1280, 3) of the whole cell; None without a render mode.
 
         Raises:
             gymnasium.error.ResetNeeded: there is no scene yet.
@@ -209,12 +209,12 @@ class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         return self._eval("observation")
 
     def _eval(self, port: str) -> Any:
-        """The value of an output port of the station."""
+        """Returns the value of an output port of the station."""
         assert self._station is not None and self._episode is not None
         return self._station.GetOutputPort(port).Eval(self._episode.context)
 
     def _with_heights(self, action: PickPlaceAction) -> PickPlaceAction:
-        """Adds surface heights, read off the agent's o_t, to the action."""
+        """Adds surface heights, which are read from the agent's o_t, to the action."""
         heights = read_surface_heights(self._observation(), action.pick, action.place)
         return dataclasses.replace(action, heights=heights)
 
@@ -225,7 +225,7 @@ class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         return arrays
 
     def _images(self, camera: str) -> dict[str, NDArray[Any]]:
-        """The images from which o_t was projected, with the scenario's noise."""
+        """Returns the images from which o_t was projected, with the scenario's noise."""
         colour, depth = (self._eval(f"{kind}_image_{camera}").data for kind in ("color", "depth"))
         return {"colour": np.array(colour[:, :, :3]), "depth": np.array(depth[:, :, 0])}
 

@@ -40,16 +40,17 @@ from systems.signals import PickPlaceAction
 
 
 class JointEnvironment(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32]]):
-    """A scenario's station as an environment in which the agent commands the joints. Policy and
-    planner do nothing.
+    """A scenario's station as an environment in which the agent commands the joints. The scenario's
+    policy and planner are not used.
 
     - Names and values are those of `collect --export lerobot`: see `policies.data.frames`.
     - Observation: `observation.state`, and `observation.images.CAMERA` of each camera.
     - Action: a target for each of `names`, in m and rad, to be reached at the end of the period.
       Commands move to it in a straight line, no faster than the joints' velocity limits.
-    - Reward: the increase of the task's reward. It adds up to 1 when every goal is filled.
-    - Terminated: every goal is filled and all objects rest, released. Truncated: the scenario's
-      `time_limit` is over, or the simulation failed (`info["failure"]`).
+    - Reward: the increase of the task's reward. The sum of all rewards is 1 when every goal is
+      filled.
+    - Terminated: every goal is filled, and all objects are released and at rest. Truncated: the
+      scenario's `time_limit` is over, or the simulation failed (`info["failure"]`).
     - `info`: `seed`, `seconds`, `is_success`, `success_rate`, `strict_success_rate`, `failure`, and
       `objects` as in `results.json`.
     """
@@ -71,12 +72,12 @@ class JointEnvironment(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32
         """
         Args:
             scenario: a scenario file, or the name of one of the project's.
-            scenario_name: name of a scenario in the file; None for the first.
+            scenario_name: the name of a scenario in the file; None for the first.
             scenario_text: YAML that is merged over the scenario, such as `{robot: !FrankaArm {}}`.
             perturb: perturbations, as for `--perturb`.
-            fps: steps per simulated second.
-            image_width: largest width of the images, in pixels.
-            cameras: names of the cameras whose images are observed; empty for all.
+            fps: the number of steps per simulated second.
+            image_width: the largest width of the images, in pixels.
+            cameras: the names of the cameras whose images are observed; empty for all.
             render_mode: `rgb_array` for `render`, or None.
 
         Raises:
@@ -117,7 +118,7 @@ class JointEnvironment(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32
         return self._chosen.scenario
 
     def _limits(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float64]]:
-        """The smallest and largest targets, and the largest rates of the joints."""
+        """Returns the smallest and the largest targets, and the largest rates of the joints."""
         plant = MultibodyPlant(self.scenario.plant.time_step)
         scene_graph = SceneGraph()
         plant.RegisterAsSourceForSceneGraph(scene_graph)
@@ -178,14 +179,14 @@ class JointEnvironment(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32
             action: a target for each of `names`, clipped to the `action_space`.
 
         Raises:
-            ValueError: the action does not have that many finite numbers.
+            ValueError: the action does not have one finite number for each of `names`.
             gymnasium.error.ResetNeeded: no episode has begun, or it is over.
         """
         if self._is_over or self._station is None or self._simulator is None:
             raise gymnasium.error.ResetNeeded("no episode is running: call reset() first")
         given = np.asarray(action, dtype=float)
         if given.shape != self._target.shape or not np.isfinite(given).all():
-            raise ValueError(f"an action has {len(self.names)} finite numbers, not {given}")
+            raise ValueError(f"an action must have {len(self.names)} finite numbers, not {given}")
         failure = None
         try:
             self._advance(given)
@@ -253,7 +254,7 @@ class JointEnvironment(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32
         }
 
     def render(self) -> NDArray[np.uint8] | None:
-        """(800, 1280, 3) picture of the whole cell at present; None without a render mode.
+        """Returns a picture (800, 1280, 3) of the whole cell; None without a render mode.
 
         Raises:
             gymnasium.error.ResetNeeded: there is no scene yet.

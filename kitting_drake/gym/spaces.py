@@ -20,18 +20,22 @@ _ANGLES = [2, 5]
 
 
 def action_space(grid: PixelGrid) -> spaces.Box:
-    """The space of actions, (7,) float64 with the entries `ACTION`: positions in the workspace and
-    angles in [-pi, pi]."""
+    """Returns the space of actions: (7,) float64 with the entries `ACTION`, whose positions lie in
+    the workspace and whose angles lie in [-pi, pi]."""
     low, high = (grid.x_min, grid.y_min, -math.pi), (grid.x_max, grid.y_max, math.pi)
     return spaces.Box(np.array([*low, *low, 0.0]), np.array([*high, *high, 1.0]), dtype=np.float64)
 
 
 def observation_space(scenario: Scenario, *, cameras: bool) -> spaces.Dict:
-    """The space of observations, a dict with `colour` (rows, cols, 3), `height` (rows, cols) in
-    metres above the table, `valid` and `in_view` (rows, cols), as in `Observation`. With `cameras`,
-    the key `cameras` holds the images of each camera: `colour` (height, width, 3) and `depth`
-    (height, width) in metres, which is infinite for points that are too far and 0 for points that
-    are too near."""
+    """Returns the space of observations, which are dicts with these keys, as in `Observation`:
+
+    - `colour` (rows, cols, 3);
+    - `height` (rows, cols), in metres above the table;
+    - `valid` and `in_view` (rows, cols);
+    - `cameras`, if it is requested: for each camera `colour` (height, width, 3), and `depth`
+      (height, width) in metres, which is 0 for points that are too near and infinite for points
+      that are too far.
+    """
     grid = scenario.heightmap.grid()
     depth_range = grid.z_max - grid.z_min
     parts: dict[str, spaces.Space[Any]] = {

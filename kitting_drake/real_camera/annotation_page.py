@@ -7,7 +7,7 @@ The server listens on 127.0.0.1 only. It answers these requests in HTML, JSON or
 - `GET /steps/N/color.png` and `height.png`: o_t, with one image pixel per grid pixel.
 - `POST /steps/N` with the content of an `action.json`: writes it to the folder of the frames.
 
-An error is answered with `{"error": ...}`, a sentence, and the status 400, 403 or 404.
+An error is answered with the status 400, 403 or 404, and with a sentence in `{"error": ...}`.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _HOST = "127.0.0.1"
 _LONGEST = 100_000
 """The largest size of an action in JSON, in bytes."""
 _LEAST_RANGE = 0.02
-"""The least height for which white stands, in metres. It keeps noise on an empty table dark."""
+"""The least height that is drawn white, in metres. It keeps the noise of an empty table dark."""
 _UNSEEN = np.array([60, 0, 90], np.uint8)
 """The colour (RGB) of pixels that no camera sees."""
 
@@ -73,7 +73,9 @@ class AnnotationServer(ThreadingHTTPServer):
         try:
             super().__init__((_HOST, port), _Handler)
         except OSError as error:
-            raise UserError(f"port {port} cannot be used: {error.strerror}") from error
+            raise UserError(
+                f"port {port} cannot be used ({error.strerror}): give another one"
+            ) from error
 
     @property
     def url(self) -> str:
@@ -175,8 +177,11 @@ class _Handler(BaseHTTPRequestHandler):
         """Does nothing, because the page itself reports what happens."""
 
     def _is_local(self) -> bool:
-        """Whether the request's Host header names this machine; a foreign name may also point to
-        it."""
+        """Whether the request's Host header names this machine.
+
+        The page of another host may reach this server by a name that points to this machine (DNS
+        rebinding).
+        """
         name = self.headers.get("Host", "").split(":")[0]
         return name in (_HOST, "localhost")
 

@@ -36,18 +36,18 @@ class Choice:
 
     action: PickPlaceAction
     confidence: float | None
-    """The confidence from 0 to 1; None for a geometric rule without confidence."""
+    """The confidence from 0 to 1; None if the policy estimates none for this action."""
     parts: dict[str, float] = field(default_factory=dict)
     """The certainty of the networks, by part; see `certainty`."""
     draw: Draw = _draw_nothing
-    """Draws the decision as a PNG; with an empty title, the action's own word is the title."""
+    """Draws the decision as a PNG, with a given title. If it is empty, the title is the kind of
+    action."""
     reason: str = ""
-    """A sentence that says why the policy acts or stops; empty if the action's own word says
-    enough."""
+    """A sentence that says why the policy acts or stops; empty if `action.reason` says it."""
 
     @classmethod
     def stopped(cls, observation: Observation) -> Choice:
-        """Returns a stop without a decision."""
+        """Makes the choice to stop, for observations on which no policy decides."""
         action = PickPlaceAction(stop=True)
         return cls(action, None, draw=partial(_draw_action, observation, action))
 

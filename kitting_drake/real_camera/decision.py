@@ -32,8 +32,8 @@ from systems.signals import (
 from systems.surface_heights import read_surface_heights
 
 _SEEN_TO_STOP = 0.7
-"""The least measured share of the pixels in view. Below it an object may be hidden, so the policy
-does not act."""
+"""The least measured share of the pixels in view at which a policy may say that nothing is left to
+do. If less is measured, an object may be hidden, and the result is `not seen`."""
 
 
 @dataclass(frozen=True)
@@ -148,7 +148,8 @@ def decide(
         failed_picks: the poses of failed grasps in the base frame, which the policy avoids.
         parameters: the parameters of the motion, which determine its heights; None for the
             simulated cell's defaults.
-        robot: the arm for which to plan a joint trajectory; None: the reach is not checked.
+        robot: the arm for which to plan a joint trajectory; None to plan none and not to check the
+            reach.
 
     Raises:
         UserError: frames, calibration and policy do not fit together, or the robot cannot reach its

@@ -1,4 +1,5 @@
-"""Reads and writes `action.json`: the action of a person or robot for the frame beside it."""
+"""Reads and writes `action.json`: a person's or robot's action for the frames in the same
+folder."""
 
 from __future__ import annotations
 

@@ -53,32 +53,40 @@ from systems.signals import Observation, PixelGrid
 _TOOLS_A_BATCH = 12
 _TOOLSETS_A_BATCH = 10
 _SCENES_A_TOOLSET = 4
-"""The largest number of scenes of one set of tools. A scene is left out if there is no room for its
-tools."""
+"""The largest number of scenes of one set of tools. After a scene without room for its tools, the
+remaining scenes of the set are left out."""
 
 _COUNTS = np.array([2, 4, 8, 24, 8, 6, 4, 2, 2, 1, 1, 1], float)
-"""Relative frequencies of kits with 1, 2, ... 12 tools. Four tools are most frequent."""
+"""The relative frequencies of kits with 1, 2, ... 12 tools. Four tools are most frequent."""
 _MOST_LOOSE = 8
-"""Largest number of loose tools in a scene. All others are seated, because the workspace is too
-small for more."""
+"""The largest number of loose tools in a scene. All other tools are seated, because the workspace
+is too small for more loose ones."""
 _CLUTTERED = 0.5
-"""Share of scenes with clutter, which are objects without a cavity."""
-_MOST_STRANGERS, _MOST_BOXES = 2, 6
-"""Largest numbers of other tools and of boxes in the clutter."""
+"""The share of scenes with clutter, that is, objects without a cavity."""
+_MOST_STRANGERS = 2
+"""The largest number of tools in the clutter."""
+_MOST_BOXES = 6
+"""The largest number of boxes in the clutter."""
 _STARTS = {"apart": 0.6, "touching": 0.28, "crossed": 0.04, "leaning": 0.04, "heap": 0.04}
-"""Ways in which the loose tools lie, each with its share of the scenes."""
-_RAISED, _TILTED = 0.15, 0.15
-"""Shares of scenes whose kit stands on a riser, and whose kit is tilted."""
-_RISERS, _MOST_TILT_DEG = (0.01, 0.06), 5.0
-"""Range of the risers' heights in metres, and the largest tilt."""
-_FLAT, _ON_TABLE = np.cos(np.radians(2.0)), 0.001
-"""A tool lies flat if the cosine of its tilt is above the first number, and its origin is closer to
-the table than the second, in metres."""
+"""The arrangements of loose tools, each with its share of the scenes."""
+_RAISED = 0.15
+"""The share of scenes whose kit stands on a riser."""
+_TILTED = 0.15
+"""The share of scenes whose kit is tilted."""
+_RISERS = (0.01, 0.06)
+"""The range of the risers' heights, in metres."""
+_MOST_TILT_DEG = 5.0
+"""The largest tilt of a kit, in degrees."""
+_FLAT = np.cos(np.radians(2.0))
+"""The cosine of the tilt below which a tool lies flat."""
+_ON_TABLE = 0.001
+"""The distance of a tool's origin from the table, in metres, below which the tool lies flat."""
 _DEFAULT_VIEWS = 0.4
-"""Share of scenes that are seen by the default cameras of scenarios."""
+"""The share of scenes that are seen by the default cameras of scenarios."""
 _WALL = 0.003
+"""The least thickness of a block below its deepest cavity, in metres."""
 _IN_CAVITY = 0.0008
-"""Standard deviation of a seated tool's position in its cavity, in metres."""
+"""The standard deviation of a seated tool's position in its cavity, in metres."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +97,7 @@ class LooseTool:
     X_WT: RigidTransform
     X_WGoal: RigidTransform
     around: tuple[CrossSection, ...]
-    """The outlines of everything else on the table, seen from above, in metres."""
+    """The outlines, seen from above in metres, of the kit and of all other objects on the table."""
 
 
 @dataclass(frozen=True)
@@ -109,8 +117,8 @@ class DrawnScene:
     def static_scene(self) -> StaticScene | None:
         """Renders the scene and adds the labels for training.
 
-        Only actions whose pick and place are in view have labels. Returns None if tools are loose
-        but no action has a label: such a scene is not final, and shows nothing to learn.
+        Only actions whose pick and place are in view become labels. Returns None if tools are loose
+        but there is no label, because a network can learn nothing from such a scene.
         """
         observation = self.render(PixelGrid())
         rows = [row for number, loose in enumerate(self.loose) for row in _actions(number, loose)]
@@ -167,7 +175,7 @@ def draw_scenes(seed: int, *, default_views: float = _DEFAULT_VIEWS) -> Iterator
                     drawn = replace(drawn, cameras=draw_views(views))
                 yield drawn
         except UserError:
-            # There is no room for these tools, so leave out the scene.
+            # There is no room for these tools, so leave out their remaining scenes.
             continue
 
 
@@ -198,8 +206,8 @@ def _draw_scene(
     rng: np.random.Generator,
     noise_seed: int,
 ) -> DrawnScene:
-    """Draws a scene of a kit and its tools, in some scenes with other tools without a cavity as
-    clutter."""
+    """Draws a scene of a kit and its tools. Some scenes also have clutter: other tools, and
+    boxes."""
     grid = PixelGrid()
     kit = drawn.kit
     loose = _draw_loose(len(tools), rng)
@@ -242,7 +250,7 @@ def _draw_scene(
 
 
 def _pose_in_kit(kit: Kit, index: int) -> RigidTransform:
-    """The pose of a seated tool in the kit's frame."""
+    """Returns the pose of a seated tool in the kit's frame."""
     pose = kit.goal(index)
     return RigidTransform(RollPitchYaw(0, 0, pose.yaw), [pose.x, pose.y, pose.z])
 
@@ -287,15 +295,15 @@ def _lies_flat(X_WT: RigidTransform) -> bool:
 
 
 def _outline(tool: RandomTool, X_WT: RigidTransform) -> CrossSection:
-    """The outline of a tool seen from above, in metres. For a tool that does not lie flat it is
-    that of its convex hull."""
+    """Returns the outline of a tool seen from above, in metres. If the tool does not lie flat, its
+    convex hull is used."""
     if _lies_flat(X_WT):
         return outline_at(tool.footprint, X_WT)
     return projected(tool.triangles.reshape(-1, 3), X_WT)
 
 
 def _draw_loose(count: int, rng: np.random.Generator) -> list[int]:
-    """Draws which of `count` tools are loose; the others are seated."""
+    """Draws the indices of the loose tools among `count` tools. The other tools are seated."""
     order = rng.permutation(count)
     seated = int(rng.integers(0, count + 1))
     if rng.random() < 0.5:
@@ -304,7 +312,7 @@ def _draw_loose(count: int, rng: np.random.Generator) -> list[int]:
 
 
 def _actions(number: int, loose: LooseTool) -> list[tuple[float, ...]]:
-    """The rows of `StaticScene.actions` for one loose tool."""
+    """Returns the rows of `StaticScene.actions` for one loose tool."""
     rows: list[tuple[float, ...]] = []
     X_WT, X_WGoal = loose.X_WT, loose.X_WGoal
     if not _lies_flat(X_WT):
@@ -326,7 +334,8 @@ def _actions(number: int, loose: LooseTool) -> list[tuple[float, ...]]:
 
 
 def _in_view(observation: Observation, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """(n,) whether points (n, 2) of the world, in metres, lie in the view of a camera."""
+    """Returns a mask (n,) of the points (n, 2) in the world, in metres, that a camera has in
+    view."""
     shape = observation.in_view.shape
     pixels = np.rint([observation.grid.to_pixel(point) for point in points]).reshape(-1, 2)
     inside = ((pixels >= 0) & (pixels < shape)).all(axis=1)
@@ -335,7 +344,7 @@ def _in_view(observation: Observation, points: NDArray[np.float64]) -> NDArray[n
 
 
 def _draw_noise(rng: np.random.Generator) -> SensorNoiseParameters:
-    """Draws parameters of the camera noise, from none to that of a poor camera with a poor
+    """Draws parameters of the camera noise, from no noise to that of a poor camera with a poor
     calibration."""
     if rng.random() < 0.25:
         return SensorNoiseParameters()

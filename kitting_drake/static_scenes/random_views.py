@@ -7,16 +7,18 @@ import numpy as np
 from kitting_drake.scenario.cameras import Camera, LookAt
 
 _COUNTS = (0.5, 0.25, 0.25)
-"""Shares of scenes with one, two and three cameras."""
+"""The shares of scenes with one, two and three cameras."""
 _STEEPEST = 60.0
 """The largest angle of a viewing direction from straight down, in degrees."""
 _DISTANCE = (0.65, 1.1)
-"""Range of the distance from a camera to the point that it looks at, in metres."""
-_MIDDLE, _ASIDE = (0.5, 0.0), (0.08, 0.15)
-"""The point that a camera looks at: the workspace's middle (x, y), and the largest deviation from
-it along x and y, in metres."""
+"""The range of the distance from a camera to the point that it looks at, in metres."""
+_MIDDLE = (0.5, 0.0)
+"""The middle (x, y) of the workspace, in metres."""
+_ASIDE = (0.08, 0.15)
+"""The largest distances, along x and y in metres, from the workspace's middle to the point that a
+camera looks at."""
 _FOCAL = (430.0, 620.0)
-"""Range of the focal lengths, in pixels of an image of 640 x 480 pixels."""
+"""The range of the focal lengths, in pixels, for images of 640 x 480 pixels."""
 
 
 def draw_views(rng: np.random.Generator) -> dict[str, Camera]:

@@ -90,7 +90,7 @@ def render(
 
 
 def block_text(size: tuple[float, float, float]) -> str:
-    """A box as Wavefront text. Its frame is in the middle of its bottom."""
+    """Returns a box as Wavefront text. Its origin is in the middle of its bottom."""
     return solid_text(Manifold.cube(size, True).translate((0, 0, size[2] / 2)))
 
 
@@ -104,5 +104,5 @@ def solid_text(solid: Manifold) -> str:
 
 
 def _obj(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> str:
-    """A mesh as Wavefront text with face normals, which the renderer needs."""
+    """Returns a mesh as Wavefront text with face normals, which the renderer needs."""
     return flat_obj(vertices, faces, digits=6, normal_digits=3)

@@ -101,7 +101,7 @@ class BenchCamera:
 
     @cached_property
     def rays(self) -> DepthRays:
-        """Returns the rays of the depth image's pixels.
+        """The rays of the depth image's pixels.
 
         Raises:
             UserError: the distortion cannot be inverted.
@@ -136,7 +136,7 @@ class Calibration:
 
     @cached_property
     def region(self) -> NDArray[np.bool_] | None:
-        """Returns the pixels (rows, cols) of o_t that are on the table, or None if all are.
+        """A mask (rows, cols) of the pixels of o_t that are on the table; None if all of them are.
 
         Raises:
             UserError: the outline misses the workspace.
@@ -170,8 +170,8 @@ def read_calibration(
 
     Args:
         path: the file.
-        table_height: the table's height in the base frame, in metres. None: the file's, or zero if
-            the file has none.
+        table_height: the table's height in the base frame, in metres; None for the height in the
+            file, or zero if the file gives none.
         poses: whether cameras must have poses. If not, a missing pose becomes the identity.
 
     Raises:

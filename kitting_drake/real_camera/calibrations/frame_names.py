@@ -34,9 +34,9 @@ class FoundPose:
     where: str
     """The file or field, for error messages."""
     parent: str = ""
+    """The name of the frame `parent`; empty if the file does not give it."""
     child: str = ""
-    """The name of the frame `child`; empty if the file does not give it. The same holds for
-    `parent`."""
+    """The name of the frame `child`; empty if the file does not give it."""
     in_hand: bool | None = None
     """Whether the camera is on the hand; None if the file does not say it."""
 
@@ -49,7 +49,8 @@ class FoundPose:
 
 @dataclass(frozen=True)
 class FrameNames:
-    """The names of the base and camera frames that a user gives for ambiguous files; else empty."""
+    """The names of the base's and the camera's frames, which a user gives if a file is ambiguous;
+    otherwise empty."""
 
     base: str = ""
     camera: str = ""
@@ -77,8 +78,8 @@ def directed(found: FoundPose, names: FrameNames) -> FoundPose:
     """Returns the pose of the camera in the base or the hand, inverted if the frame names require
     it.
 
-    Without names, the pose is taken as that of the camera in the base. A hand-eye calibration
-    states itself which pose it holds.
+    A pose without frame names is returned unchanged. So is that of a hand-eye calibration, whose
+    file states which pose it is.
 
     Raises:
         UserError: the names are ambiguous, or neither frame is a camera.

@@ -24,20 +24,21 @@ _MODELS = {
     **dict.fromkeys(("equidistant", "equi", "fisheye", "kannala_brandt4"), EQUIDISTANT),
 }
 _COUNTS = {BROWN: (0, 4, 5, 8, 12, 14), INVERSE_BROWN: (0, 5), EQUIDISTANT: (4,)}
-_THIN_PRISM, _TILT = 8, 12
-"""The numbers of coefficients in OpenCV's list before those of a thin prism, and before those of a
-tilted sensor."""
+_THIN_PRISM = 8
+"""The number of coefficients in OpenCV's list before those of a thin prism."""
+_TILT = 12
+"""The number of coefficients in OpenCV's list before those of a tilted sensor."""
 _UNDONE = 1e-4
-"""The largest error of a ray that is undistorted and distorted again, at depth 1."""
+"""The largest error, at depth 1, of a ray that is undistorted and then distorted again."""
 _WIDEST = np.deg2rad(85)
 """The largest angle of a ray from the optical axis, in radians."""
 
 
 def known_model(name: object, where: str) -> str:
-    """Returns the model that a usual name stands for.
+    """Returns the model for one of its usual names.
 
     Raises:
-        UserError: this module has no such model.
+        UserError: the name is not that of a model in this module.
     """
     key = str(name or "").strip().lower().replace(" ", "_").replace("-", "_")
     if key not in _MODELS:

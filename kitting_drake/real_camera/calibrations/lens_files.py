@@ -36,8 +36,8 @@ def read_lens_file(path: Path, stream: str, resolution: tuple[int, int] | None) 
         path: the file, or a recording with a CameraInfo.
         stream: the lens to take if there are several: kalibr's cam1, RealSense's Color, or a topic.
             The camera's name may also be given; it is used only if it matches a lens.
-        resolution: the (width, height) of one of RealSense's streams, in pixels; None if there is
-            only one.
+        resolution: the (width, height) of a RealSense stream, in pixels; None if the file has the
+            stream in only one resolution.
 
     Raises:
         UserError: the file is unreadable, or holds no such lens.
@@ -171,9 +171,11 @@ def _realsense_text(
     if len(lenses) != 1:
         size = "" if resolution is None else f" of {resolution[0]}x{resolution[1]} pixels"
         sizes = sorted({key.partition(" ")[0] for key in lenses})
-        told = f"sizes {', '.join(sizes)}: give resolution: [WIDTH, HEIGHT]" if lenses else "none"
+        if not lenses:
+            raise UserError(f"{path} has no intrinsics of the stream {wanted}{size}: give another")
         raise UserError(
-            f"{path}: there are {len(lenses)} intrinsics of the stream {wanted}{size}: {told}"
+            f"{path} has {len(lenses)} intrinsics of the stream {wanted}{size}, for the sizes "
+            f"{', '.join(sizes)}: give resolution: [WIDTH, HEIGHT]"
         )
     return next(iter(lenses.values()))
 
@@ -195,7 +197,7 @@ def _realsense_block(text: str, where: str) -> dict[str, Any]:
 
 
 def _librealsense(model: str, values: list[Any], where: str) -> dict[str, Any]:
-    """Converts a distortion with librealsense's name of its model, such as
+    """Converts distortion coefficients whose model is given by librealsense's name, such as
     distortion.brown_conrady."""
     name = model.rpartition(".")[2].replace("_", " ").lower()
     coefficients = numbers(values, f"{where}: coefficients")

@@ -32,8 +32,8 @@ Array = NDArray[np.float64]
 _ROUNDED = 2e-3
 """The tolerance for a quaternion of tf2_echo, which prints three decimals."""
 _STILL = 2e-3
-"""The largest difference between repeated outputs of tf2_echo for a frame at rest, in metres, or in
-the numbers of a quaternion."""
+"""The largest difference between the poses that tf2_echo prints repeatedly for a frame at rest. It
+holds for positions in metres and for the numbers of a quaternion."""
 _NUMBERS = r"\[\s*([^\]]*?)\s*\]"
 _ECHO = re.compile(rf"Translation:\s*{_NUMBERS}.*?in Quaternion(?:\s*\(xyzw\))?\s*{_NUMBERS}", re.S)
 _ECHO_CALL = re.compile(r"\btf2?_echo[ \t]+([\w/.-]+)[ \t]+([\w/.-]+)")

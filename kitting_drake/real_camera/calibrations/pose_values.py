@@ -104,7 +104,7 @@ def assembled(R: Array, position: Array) -> Array:
 
 
 def rigid(X: Array, where: str) -> Array:
-    """Returns the same pose (4, 4) after checks.
+    """Checks a pose (4, 4) and returns it.
 
     Raises:
         UserError: the rotation is not orthonormal, or the position is not in metres.

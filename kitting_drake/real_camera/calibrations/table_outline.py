@@ -31,20 +31,20 @@ _NOT_AN_IMAGE = (OSError, SyntaxError, ValueError, TypeError, Image.Decompressio
 
 @dataclass(frozen=True)
 class TableOutline:
-    """The areas that are table, and the areas that are not, such as the robot's base or the
-    floor."""
+    """The parts of the workspace that are table, and those that are not, such as the robot's base
+    or the floor."""
 
     region: Polygon = ()
-    """A polygon around the table. Empty: the table is everywhere."""
+    """A polygon around the table; empty if the table is everywhere."""
     ignore: tuple[Polygon, ...] = ()
     """Polygons in which there is no table."""
     mask: tuple[bytes, ...] = ()
-    """A byte for each pixel of each row of the workspace, 1 for table. Empty: the table is
-    everywhere."""
+    """For each row of the workspace, a byte for each pixel, which is 1 for table; empty if the
+    table is everywhere."""
 
     def inside(self, grid: PixelGrid) -> NDArray[np.bool_] | None:
-        """Returns the pixels (rows, cols) whose centres are on the table, or None without an
-        outline.
+        """Returns a mask (rows, cols) of the pixels whose centres are on the table; None if there
+        is no outline.
 
         Args:
             grid: the pixels of the workspace.
@@ -71,7 +71,7 @@ class TableOutline:
         return inside
 
     def record(self) -> dict[str, Any]:
-        """Returns the outline as fields of a calibration, without those that are not given."""
+        """Returns the outline as fields of a calibration, without empty fields."""
         content: dict[str, Any] = {}
         if self.region:
             content["region"] = [list(corner) for corner in self.region]
@@ -85,8 +85,10 @@ class TableOutline:
         return content
 
     def mask_digest(self) -> str:
-        """Returns a digest of the mask's pixels, which unlike a PNG does not depend on
-        libraries."""
+        """Returns a digest of the mask's pixels.
+
+        A digest of the PNG would depend on the version of the library that wrote it.
+        """
         return hashlib.sha256(b"\n".join(self.mask)).hexdigest()[:16]
 
 
@@ -190,7 +192,8 @@ def _unpacked(mask: Sequence[bytes], grid: PixelGrid) -> NDArray[np.bool_]:
 def _covered(
     polygon: Polygon, xy: NDArray[np.float64], grid: PixelGrid, what: str
 ) -> NDArray[np.bool_]:
-    """Returns the pixels (rows, cols) inside a polygon; raises UserError if there are none."""
+    """Returns a mask (rows, cols) of the pixels inside a polygon; raises UserError if there are
+    none."""
     covered = inside_polygon(xy, polygon)
     if covered.any():
         return np.asarray(covered)

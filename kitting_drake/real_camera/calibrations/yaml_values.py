@@ -53,7 +53,7 @@ def read_text(path: Path) -> str:
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """Returns the mapping in a YAML or JSON file; that of the first document if there are several.
+    """Returns the mapping in a YAML or JSON file. Only its first document is read.
 
     Raises:
         UserError: the file is unreadable or does not hold a mapping.
@@ -62,7 +62,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 
 def parse_yaml(text: str, path: Path) -> dict[str, Any]:
-    """Returns the mapping in a YAML or JSON text; that of the first document if there are several.
+    """Returns the mapping in a YAML or JSON text. Only its first document is read.
 
     Raises:
         UserError: the text does not hold a mapping. The message names the file.
@@ -83,7 +83,8 @@ def parse_yaml(text: str, path: Path) -> dict[str, Any]:
         raise UserError(f"{path}:{where} {problem}") from error
     except (ValueError, KeyError, AttributeError) as error:
         # Such errors come from text that resembles a date, or a tag that does not fit its value.
-        raise UserError(f"{path} is not YAML: {error}") from error
+        reason = str(error) if isinstance(error, ValueError) else "a tag does not fit its value"
+        raise UserError(f"{path} is not YAML: {reason}") from error
     except RecursionError as error:
         raise UserError(f"{path} is nested too deeply") from error
     if not isinstance(first, dict):

@@ -35,12 +35,13 @@ _SHARED = 100
 
 @dataclass(frozen=True)
 class TableCheck:
-    """The plane, noise and holes of the table, as one or all cameras see it."""
+    """The plane, noise and holes of the table, as seen by one camera or by all together."""
 
     tilt: Array
     """The apparent rotation (2,) of the table about base x and y, in radians."""
     bias: float
-    """The apparent height of the table at the workspace's centre, minus the true one, in metres."""
+    """The apparent height of the table at the workspace's centre minus its true height, in
+    metres."""
     noise: float
     """A robust estimate of the standard deviation of the heights, in metres."""
     holes: float
@@ -62,8 +63,8 @@ class CameraCheck:
     depth_bias: float
     """The constant depth error that would explain the heights if the pose were right, in metres."""
     depth_bias_noise: float
-    """A robust estimate of the standard deviation of the heights after subtracting that error, in
-    metres."""
+    """A robust estimate of the standard deviation of the heights, in metres, if `depth_bias` is
+    corrected."""
     block: SeenBlock | None
 
 
@@ -75,10 +76,11 @@ class Check:
     together: TableCheck
     """The check of o_t, which contains the highest point in each pixel."""
     disagreements: dict[tuple[str, str], float]
-    """For each pair of cameras, how much higher the first sees the table, in metres."""
-    block_shifts: dict[tuple[str, str], Array]
-    """For each pair of cameras, the block's position (2,) in the first minus that in the second, in
+    """For each pair of cameras, how much higher the first camera sees the table than the second, in
     metres."""
+    block_shifts: dict[tuple[str, str], Array]
+    """For each pair of cameras, the block's position (2,) as the first camera sees it minus that as
+    the second sees it, in metres."""
     block: Block | None
     corrected: Calibration
     heights: dict[str, NDArray[np.float32]]
@@ -93,8 +95,8 @@ def check_cameras(
 
     Each camera's pose is corrected by a rotation that makes the table level, and then by a vertical
     shift. With a block, the cameras are also shifted horizontally and rotated about the vertical,
-    so that they agree on the block's pose. That is the given pose, or else the mean of the poses
-    they see.
+    so that they agree on the block's pose. This is the pose in `block`, if it is given, or else the
+    mean of the poses that the cameras see.
 
     Args:
         frames: a frame of each camera, by camera name, with nothing but the block on the table.
@@ -158,7 +160,7 @@ def levelled(X_BC: Array, plane: Plane, grid: PixelGrid) -> Array:
     R = plane.levelling()
     corrected = X_BC.copy()
     corrected[:3, :3] = R @ X_BC[:3, :3]
-    # The height of the plane below the camera after the rotation, which is about the camera.
+    # Find the height of the plane below the camera, after the rotation about the camera.
     point = np.array([*X_BC[:2, 3], float(plane.height(X_BC[:2, 3]))])
     height = (R @ (point - X_BC[:3, 3]) + X_BC[:3, 3])[2]
     corrected[2, 3] += grid.z_min - height

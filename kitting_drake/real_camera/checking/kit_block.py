@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 _LEAST_PIXELS = 400
 _CLEAN = 0.0005
-"""The noise of heights, in metres, above which they are filtered."""
+"""The noise of heights, in metres, above which the heights are filtered."""
 _LEAST_BAND = 0.001
 """The least distance from the top's height within which points belong to the top, in metres. Three
 times the noise is used if it is larger."""
@@ -67,8 +67,8 @@ def see_block(
     plane of the top, and each pixel covers an area on it. The moments of these areas give the
     centre, the direction and the sides of the top without bias.
 
-    Pixels near the top's height count as its top, and some of them may show a side wall. They add a
-    strip, whose width is computed and subtracted. Recesses inside the outline do not matter, but
+    Some of the selected pixels may show a side wall just below the top. They widen the top by a
+    strip, whose width is computed and subtracted. Recesses inside the top's outline do no harm, but
     notches in the outline do.
 
     Args:
@@ -125,7 +125,7 @@ def see_block(
 def _filled(mask: NDArray[np.bool_], camera: BenchCamera) -> NDArray[np.bool_]:
     """Returns the largest part of a mask, with its holes filled.
 
-    The convex hull would instead follow the outermost points of a noisy outline.
+    A convex hull is not used, because it follows the outermost points of a noisy outline.
     """
     mask = ndimage.binary_fill_holes(ndimage.binary_closing(mask, iterations=2))
     mask = ndimage.binary_opening(mask, iterations=3)

@@ -22,9 +22,11 @@ _HALF_WORKSPACE = 0.5
 """Half the length of the workspace, in metres."""
 _LEVEL = math.radians(0.02)
 """The tilt, in radians, below which a table counts as level."""
-_CLEAN, _NOISY = 0.0005, 0.0016
-"""Noise levels in metres: heights are filtered above the first, and details of 3 mm are lost above
-the second (see `policies/matching/segmentation.py`)."""
+_CLEAN = 0.0005
+"""The noise, in metres, above which heights are filtered (see
+`policies/matching/segmentation.py`)."""
+_NOISY = 0.0016
+"""The noise, in metres, above which details of 3 mm are lost."""
 _LOST = 1.8
 """The height below which details are lost, as a multiple of the noise. It is two standard
 deviations of the filtered noise, which is nine tenths of the original noise if neighbouring pixels

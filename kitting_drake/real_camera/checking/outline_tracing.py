@@ -17,7 +17,7 @@ Mask = NDArray[np.bool_]
 _MOST = 12
 """The largest number of corners of a polygon."""
 _INSIDE = 0.010
-"""The distance in metres by which the polygon is inside the mask."""
+"""How far inside the mask the polygon is drawn, in metres."""
 
 
 def disc(radius: float) -> Mask:
@@ -102,7 +102,7 @@ def _few(border: Array) -> Array:
 
 
 def _simplified(line: Array, tolerance: float) -> Array:
-    """Returns the corners of a line (n, 2) that approximate it within a tolerance."""
+    """Returns those corners of a line (n, 2) that approximate it within a tolerance in cells."""
     kept = np.zeros(len(line), bool)
     kept[[0, -1]] = True
     spans = [(0, len(line) - 1)]

@@ -20,8 +20,8 @@ _TRIALS = 200
 _TRIED = 2000
 """The number of points on which a trial plane is scored."""
 _THIN = 1e-3
-"""The least half-area of a triangle of three points, as seen from above, in square metres; thinner
-triples are not tried."""
+"""Twice the least area of a triangle of three points, as seen from above, in square metres. Planes
+through smaller triangles are not tried."""
 _BAND = 0.004
 """The largest distance of inliers from a trial plane, in metres."""
 _REFITS = 4
@@ -55,13 +55,13 @@ class Plane:
     @property
     def tilt(self) -> Array:
         """The rotation vector (2,) about base x and y, in radians, from the base's xy plane to this
-        one."""
+        plane."""
         axis = np.cross([0.0, 0.0, 1.0], self.normal)
         sine = np.linalg.norm(axis)
         return axis[:2] * (math.asin(min(float(sine), 1.0)) / sine if sine > 0 else 0.0)
 
     def levelling(self) -> Array:
-        """The smallest rotation (3, 3) that makes the plane horizontal."""
+        """Returns the smallest rotation (3, 3) that makes the plane horizontal."""
         return Rotation.from_rotvec([*-self.tilt, 0.0]).as_matrix()
 
 
@@ -115,7 +115,7 @@ def fit_plane(points: Array, steepest: float = 0.3) -> Plane:
 def find_planes(points: Array, most: int = 3) -> list[Plane]:
     """Finds the planes with most points, the largest first.
 
-    The points of a plane are ignored for the next ones.
+    The points of each plane are ignored in the search for the next.
 
     Args:
         points: (n, 3).
@@ -133,11 +133,11 @@ def find_planes(points: Array, most: int = 3) -> list[Plane]:
 
 
 def refit(points: Array, plane: Array) -> Plane | None:
-    """Refits a plane to the points near it; returns None if there are none.
+    """Refits a plane to the points near it; returns None if there are too few.
 
     Args:
-        points: (n, 3).
-        plane: (3,) the slope along x, the slope along y and the offset to start from.
+        points: (n, 3), in metres.
+        plane: (3,) the slopes along x and y, and the offset in metres, from which to start.
     """
     design = np.column_stack([points[:, :2], np.ones(len(points))])
     noise = _BAND

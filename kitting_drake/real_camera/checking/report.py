@@ -22,7 +22,8 @@ CHECK_FILES = ("check.json", "corrected.yaml", "check.png")
 FOUND_FILES = ("found.yaml", "found.png")
 """The files that `save_found` writes."""
 _WELL_SEEN = 0.9
-"""The visible share of the workspace in view below which the user is told."""
+"""The user is told if the cameras look at less than this share of the workspace, or measure less
+than this share of the pixels in view."""
 
 
 def print_decision(console: Console, record: dict[str, Any]) -> None:

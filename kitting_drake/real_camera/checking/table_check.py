@@ -25,23 +25,30 @@ UNVERIFIED = (
     "verified: true"
 )
 """The warning for a calibration that was not verified."""
-_REFUSED_OFF, _REFUSED_TILT = 0.010, math.radians(1.3)
-"""The largest height error, in metres, and the largest tilt of a table from which picks are
-trusted."""
-_WARNED_OFF, _WARNED_TILT = 0.005, math.radians(0.65)
+_REFUSED_OFF = 0.010
+"""The largest error of the table's height, in metres, at which the robot acts."""
+_REFUSED_TILT = math.radians(1.3)
+"""The largest tilt of the table, in radians, at which the robot acts."""
+_WARNED_OFF = 0.005
+"""The largest error of the table's height, in metres, without a warning."""
+_WARNED_TILT = math.radians(0.65)
+"""The largest tilt of the table, in radians, without a warning."""
 _STEP = 4
 """The step between the rows and columns of an image that are used."""
 _FARTHEST = 0.35
 """The distance from the table's height within which planes are searched, in metres."""
 _LEAST = 150
 """The least number of used pixels on a plane."""
-_BELOW, _ABOVE = 0.5, 0.08
-"""The least number of pixels on the plane at the table's height, as a share of those on a plane
-below it, and of those on a plane above it. Large objects may hide most of a table."""
+_BELOW = 0.5
+"""The least number of pixels on the plane at the table's height, as a share of the pixels on a
+plane below it."""
+_ABOVE = 0.08
+"""The least number of pixels on the plane at the table's height, as a share of the pixels on a
+plane above it. It is small, because large objects may hide most of a table."""
 _CURVED = 0.5
-"""The depths are distances from the camera if converting them reduces the table's noise to less
-than this share."""
-_FLAT = 0.002
+"""The depths are probably distances from the camera if their conversion to depths along the optical
+axis reduces the table's noise to less than this share."""
+_FLAT = 0.0005
 """The noise below which a table counts as flat, in metres."""
 
 
@@ -50,7 +57,7 @@ class TableFit:
     """The table as a camera sees it."""
 
     off: float
-    """The measured height at the middle of the table's visible part, minus the expected one, in
+    """The measured height at the middle of the table's visible part minus the calibrated height, in
     metres."""
     tilt: float
     """The table's angle with the base's xy plane, in radians."""
@@ -165,10 +172,9 @@ def _points(
 def _is_range(
     camera: BenchCamera, depth: NDArray[np.float32], calibration: Calibration, fit: TableFit
 ) -> bool:
-    """Whether the depths seem to be distances from the camera.
-
-    Then the table is flat only if they are converted to depths."""
-    if fit.plane.noise < _FLAT / 4:
+    """Whether the depths seem to be distances from the camera, because the table is flat only after
+    they are converted to depths along the optical axis."""
+    if fit.plane.noise < _FLAT:
         return False
     points = _points(camera, camera.X_BC, _as_depth(camera, depth), calibration)
     other = refit(points, np.array([0.0, 0.0, calibration.table_height])) or next(
@@ -207,7 +213,8 @@ def _hint(
 def _suppositions(
     camera: BenchCamera, depth: NDArray[np.float32]
 ) -> Iterator[tuple[str, BenchCamera, Array, NDArray[np.float32]]]:
-    """Yields frequent mistakes: a hint, and the camera, pose and depth without the mistake."""
+    """Yields, for each frequent mistake, a hint, and the camera, pose and depth without the
+    mistake."""
     X = camera.X_BC
     yield (
         "these depths are distances from the camera: give depths along the optical axis",

@@ -31,7 +31,7 @@ _CELL = 2 * _RESOLUTION
 _SIDES = (160, 320)
 """The largest numbers of rows and columns of a proposed workspace, for 0.5 x 1.0 m."""
 _MULTIPLE = 16
-"""The number of which rows and columns are multiples."""
+"""The numbers of rows and columns are multiples of this."""
 _TILTED = math.radians(10)
 """The largest tilt, in radians, of a plane that may be a table seen with a slightly wrong pose."""
 MOST_TILT = math.radians(1.3)
@@ -45,17 +45,18 @@ _LEAST_SHARE = 0.1
 _LEAST_POINTS = 500
 """The least number of points that must lie on the table."""
 _ABOVE_FLOOR = 0.25
-"""The least height above the largest level plane, in metres, at which another level plane is a
-table and the largest one is the floor."""
+"""If another level plane is higher than the largest one by more than this, in metres, it is the
+table and the largest plane is the floor."""
 _TABLE_SHARE = 0.1
-"""The least number of points of such a table, as a share of the points of the largest plane."""
+"""The least number of points of a table above a floor, as a share of the floor's points."""
 _BAND = 0.006
 """The largest distance of points of the plane from it, in metres. Three times the noise is used if
 it is larger."""
-_LOW, _TALL = 0.12, 1.2
-"""Two heights above the table, in metres. Anything lower than the first is an object on the table;
-anything between the two, such as the robot, is not part of the table; points above the second are
-ignored."""
+_LOW = 0.12
+"""The largest height of an object on the table, in metres. Anything taller, such as the robot, is
+not part of the table."""
+_TALL = 1.2
+"""The height above the table, in metres, above which points are ignored."""
 _CLOSED = 0.035
 """Half the width, in metres, of the gaps in the table that are closed. They come from objects and
 shadows."""
@@ -69,11 +70,11 @@ _AROUND = 0.02
 _TOO_NEAR = 0.25
 """The distance from the middle of an arm's base within which it cannot pick, in metres."""
 _ENOUGH = 0.6
-"""A workspace outside that distance is chosen if the table area in it is at least this share of the
-largest possible one."""
+"""A workspace farther from the base than `_TOO_NEAR` is chosen if it holds more than this share of
+the table area that any workspace can hold."""
 _NEARLY = 0.97
-"""Workspaces count as equally good if the table area in them is at least this share of the largest
-one. The nearest is chosen."""
+"""Workspaces count as equally good if they hold at least this share of the table area of the best
+one. The nearest of them is chosen."""
 
 
 @dataclass(frozen=True)

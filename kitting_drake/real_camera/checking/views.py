@@ -179,7 +179,8 @@ def _check_depth(frame: Frame, camera: BenchCamera, calibration: Calibration) ->
         returned = np.isfinite(depth) & (depth > 0)
     if returned.mean() < _LEAST_DEPTH:
         raise CalibrationError(
-            f"depth of camera {camera.name} is all zero or NaN where it looks at the workspace"
+            f"depth of camera {camera.name} is all zero or NaN where it looks at the workspace: "
+            "check the depth image, and the camera's pose"
         )
     ratios = depth[returned] / expected[towards][returned]
     ratio = float(np.median(ratios))

@@ -47,8 +47,8 @@ def read_bag_frames(path: Path, calibration: Calibration, time: float | None) ->
         time: the time after the start of the recording, in seconds; None for the first images.
 
     Raises:
-        UserError: topics are missing or ambiguous, depth is not registered to colour, no images are
-            of the same time, or a CameraInfo is that of another lens.
+        UserError: topics are missing or ambiguous, depth is not registered to colour, no colour and
+            depth images have nearly the same time, or a CameraInfo is that of another lens.
         MachineError: a library is missing.
     """
     images = {}
@@ -126,7 +126,7 @@ def _settled(
 ) -> tuple[RecordedMessage, RecordedMessage] | None:
     """Returns a pair of images as soon as no later colour image can be closer in time.
 
-    It removes the images that cannot belong to any pair.
+    Removes from both lists the images that cannot belong to a pair.
     """
     while depths and colors:
         first = depths[0]

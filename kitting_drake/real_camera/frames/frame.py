@@ -24,7 +24,7 @@ class Frame:
 
 
 def check_frame(frame: Frame, camera: BenchCamera) -> Frame:
-    """Checks the sizes and types of a frame that was not read from files.
+    """Checks the sizes and types of a frame, and returns it with contiguous depths.
 
     Raises:
         UserError: a size or type is wrong.

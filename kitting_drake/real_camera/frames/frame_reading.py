@@ -184,8 +184,8 @@ def _check_ending(path: Path) -> None:
 def _candidates(
     folders: Sequence[Path], name: str, alone: bool, words: Sequence[str], endings: Sequence[str]
 ) -> list[Path]:
-    """Returns the existing files of a camera that have one of some words and endings in their
-    names."""
+    """Returns the existing files of a camera whose names have one of the words and one of the
+    endings."""
     stems = [f"{name}_", f"{name}/", *([""] if alone else [])]
     candidates = [
         folder / f"{stem}{word}{ending}"

@@ -15,7 +15,7 @@ _HEADER = ("FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "POINTS", "DATA
 _NEEDED = ("FIELDS", "SIZE", "TYPE", "WIDTH", "HEIGHT", "DATA")
 _UNMOVED = [0.0, 0, 0, 1, 0, 0, 0]
 _LONGEST = 100
-"""The number of lines that a header cannot exceed."""
+"""The largest number of lines of a header."""
 _KINDS = {"F": "f", "U": "u", "I": "i"}
 
 

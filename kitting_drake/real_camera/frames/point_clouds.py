@@ -79,7 +79,8 @@ def read_cloud(
 
 
 def project_points(points: Array, lens: Intrinsics) -> tuple[Array, Array]:
-    """Projects points (n, 3) in front of a lens; returns columns and rows, from pixel centres."""
+    """Projects points (n, 3) in front of a lens. Returns their columns (n,) and rows (n,) in the
+    image, in pixels; pixel centres have whole numbers."""
     x, y = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]
     if lens.distortion:
         x, y = distort(x, y, lens.model, lens.distortion)

@@ -23,8 +23,8 @@ from kitting_drake.real_camera.markers.board_poses import BoardFit, fit_board
 from kitting_drake.real_camera.markers.boards import Board, SeenBoard, find_corners
 
 _MOVED = 0.5
-"""The largest difference between the error of all images together and that of single images, in
-pixels. If it is larger, the board or the camera moved."""
+"""The largest difference, in pixels, between the error of one pose for all images and the error of
+a pose for each image. If it is larger, the board or the camera moved."""
 
 
 @dataclass(frozen=True)

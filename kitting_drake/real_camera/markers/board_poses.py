@@ -25,8 +25,8 @@ corners are poor."""
 _SAME = math.radians(1)
 """The angle in radians below which two poses count as the same."""
 _CLEARER = 16.0
-"""The least difference of the squared errors of the second-best and the best pose, in variances of
-a corner. If it is smaller, the pose is ambiguous."""
+"""The pose is ambiguous if the sum of the corners' squared errors at another pose is larger by less
+than this multiple of a corner's variance."""
 _LIKELY = 0.2
 """The error of corners that is expected in a real image, in pixels."""
 _NOISE = 0.05
@@ -56,7 +56,7 @@ def fit_board(points: Array, pixels: Array, lens: Intrinsics, where: str) -> Boa
 
     Args:
         points: (n, 3) the corners in the board's frame, in metres.
-        pixels: (n, 2) the columns and rows of the corners, from pixel centres.
+        pixels: (n, 2) the columns and rows of the corners; pixel centres have whole numbers.
         lens: the image's lens.
         where: the beginning of error messages.
 
@@ -121,8 +121,11 @@ def _refined(start: Array, points: Array, pixels: Array, lens: Intrinsics) -> tu
 
 
 def _errors(values: Array, points: Array, pixels: Array, lens: Intrinsics) -> Array:
-    """Returns the errors (2 n,) in pixels. If there is a seventh value, it is the logarithm of the
-    focal ratio."""
+    """Returns the errors (2 n,) of the corners in pixels, for a pose.
+
+    The values are a rotation vector in radians, a position in metres, and optionally the logarithm
+    of the focal ratio.
+    """
     seen = points @ Rotation.from_rotvec(values[:3]).as_matrix().T + values[3:6]
     seen[:, 2] = np.maximum(seen[:, 2], 1e-3)
     found = np.stack(project_points(seen, lens), axis=-1)

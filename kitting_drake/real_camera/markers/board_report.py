@@ -21,7 +21,7 @@ from kitting_drake.real_camera.markers.board_calibration import Calibrated, Cali
 _GOOD, _FAIR = 0.5, 1.5
 """The largest errors of corners, in pixels, that count as good and as fair."""
 _TOLD = 0.01
-"""The standard deviation above which a focal ratio says nothing."""
+"""The largest standard deviation at which a focal ratio is reported."""
 _AXES = ((230, 40, 40), (40, 180, 40), (60, 90, 255))
 
 

@@ -84,7 +84,7 @@ class SeenBoard:
     points: Array
     """The corners (n, 3) in the board's frame, in metres."""
     pixels: Array
-    """The columns and rows (n, 2) of the corners, from pixel centres."""
+    """The columns and rows (n, 2) of the corners; pixel centres have whole numbers."""
     markers: int
     """The number of markers found."""
 
@@ -205,7 +205,7 @@ def _find_markers(cv2: Any, board: Board, gray: Any) -> tuple[dict[int, Array], 
 
 
 def _centred(cv2: Any, gray: Any, quads: list[Array]) -> list[Array]:
-    """Corrects the corners (4, 2) of markers so that they are counted from pixel centres.
+    """Corrects the corners (4, 2) of markers for the shift of their refinement.
 
     OpenCV's AprilTag refinement shifts all corners by about 0.4 pixels. A second refinement, which
     is noisier but has no such bias, shows the exact shift.
@@ -223,8 +223,10 @@ def _centred(cv2: Any, gray: Any, quads: list[Array]) -> list[Array]:
 
 
 def _in_own_frame(points: Array, height: float) -> Array:
-    """Converts points from OpenCV's frame of a board: origin in the top left corner, y down, z into
-    it."""
+    """Converts points (n, 3) from OpenCV's frame of a board to the frame M (see `Board`).
+
+    The origin of OpenCV's frame is the top left corner. Its y points down and its z into the board.
+    """
     return points * [1, -1, -1] + [0, height, 0]
 
 

@@ -87,7 +87,8 @@ def camera_info_of(path: Path, stream: str) -> dict[str, Any]:
 
     Args:
         path: the recording's path.
-        stream: the topic, or a part of it. A camera's name is used only if it is a part of a topic.
+        stream: the topic, or one of its parts, such as a camera's name. If it matches no topic, it
+            is ignored.
 
     Raises:
         UserError: there is no such topic, or several match.
@@ -104,7 +105,7 @@ def camera_info_of(path: Path, stream: str) -> dict[str, Any]:
             )
         for message in recording.messages(named):
             return camera_info_fields(message.body)
-    raise UserError(f"{path} has no message of {named[0]}")
+    raise UserError(f"{path} has no message on the topic {named[0]}")
 
 
 def camera_info_fields(body: Any) -> dict[str, Any]:

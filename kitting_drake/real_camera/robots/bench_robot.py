@@ -34,16 +34,17 @@ class BenchRobot:
     base: ArmBase = dataclasses.field(default_factory=ArmBase)
     """The pose of the arm's base in the calibration's base frame."""
     home: tuple[float, float, float, float] | None = None
-    """The x, y, height of the fingertips (m) and yaw (rad) at which the hand waits; None: the
-    cell's `planner.home`. After an action it returns to this x, and keeps its y if it can."""
+    """Where the hand waits: x, y and height of the fingertips in metres, and yaw in radians. None
+    means `planner.home` of the simulated cell. After an action the hand returns to this x, and
+    keeps its y if the arm can reach that point."""
     joints: tuple[float, ...] | None = None
-    """The seven joint positions from which the arm starts, in rad; None: those of the home."""
+    """The seven joint positions from which the arm starts, in rad; None for those at `home`."""
     rate: int = FASTEST_RATE
     """The number of points of a trajectory per second."""
 
     @property
     def limits(self) -> ArmLimits:
-        """The limits of its joints."""
+        """The limits of the arm's joints."""
         return ARM_LIMITS[self.model]
 
     @property
@@ -74,7 +75,7 @@ class BenchRobot:
             parameters: the parameters of the motion.
 
         Returns:
-            The trajectory, or a sentence that says why the arm cannot move so.
+            The trajectory, or a sentence that says why the arm cannot execute the action.
 
         Raises:
             UserError: the arm cannot reach its home.

@@ -146,4 +146,5 @@ def load_trajectory(path: Path) -> ArmTrajectory:
     except OSError as error:
         raise UserError(f"cannot read {path}: {error.strerror}") from error
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise UserError(f"{path} is not a trajectory of `decide --robot`: {error}") from error
+        reason = str(error) if isinstance(error, ValueError) else "a field is missing or invalid"
+        raise UserError(f"{path} is not a trajectory of `decide --robot`: {reason}") from error
