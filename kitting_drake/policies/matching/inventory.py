@@ -165,7 +165,8 @@ class Inventory:
         return False
 
     def balance(self, region: Region) -> NDArray[np.float64] | None:
-        """(row, col) of an object's centre of mass, if the hand has measured it here; else None."""
+        """Returns (row, col) of an object's centre of mass; None if the hand has not measured it
+        where the object lies now."""
         for attempt in reversed(self._history):
             if attempt.balance is not None and self._is_there(attempt.action.pick, region):
                 return np.asarray(self.observation.grid.to_pixel(attempt.balance))

@@ -120,8 +120,8 @@ def _split(
     relief: NDArray[np.float32],
     resolution: float,
 ) -> list[Region]:
-    """Returns the objects of a region, or the region itself. Adds the recesses of the objects to
-    `taken`."""
+    """Returns the objects of a region, or the region itself if it cannot be split. Adds the
+    recesses of the objects to `taken`."""
     parts: list[_Found] = []
     rest = region.mask
     while rest.any():

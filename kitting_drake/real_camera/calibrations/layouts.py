@@ -99,7 +99,7 @@ def _read_pinhole(node: dict[str, Any], where: str) -> tuple[float, float, float
         )
     if abs(K[0, 1]) > _SKEW:
         raise UserError(
-            f"{where}: {key} has a skew of {K[0, 1]:g} pixels, its second number, which is not "
+            f"{where}: the second number of {key} is a skew of {K[0, 1]:g} pixels, which is not "
             "modelled: calibrate without skew, or rectify the images"
         )
     return float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])

@@ -78,7 +78,8 @@ def _load_matrix(path: Path) -> Array:
 
 
 def _plain_numbers(text: str) -> list[str] | None:
-    """Returns the numbers of a text that holds only numbers, as np.savetxt writes it; else None."""
+    """Returns the numbers in a text that holds nothing else, as np.savetxt writes it; None if it
+    holds other words."""
     words = re.sub(r"#[^\n]*", "", text).replace(",", " ").replace(";", " ").split()
     try:
         return words if [float(word) for word in words] else None

@@ -97,7 +97,8 @@ def findings(check: Check, planner: PickPlaceParameters | None = None) -> list[F
 
 
 def explains_depth(camera: CameraCheck) -> bool:
-    """Whether a constant depth error explains the heights as well as an error of the pose."""
+    """Whether a constant depth error fits the measured heights about as well as an error of the
+    pose does."""
     if abs(camera.depth_bias) < CLEARANCE / 4:
         return False
     return camera.depth_bias_noise < 1.05 * camera.table.noise + 5e-5

@@ -155,7 +155,8 @@ def _measured(plane: Plane, points: Array, grid: PixelGrid) -> TableFit:
 def _points(
     camera: BenchCamera, X_BC: Array, depth: NDArray[np.float32], calibration: Calibration
 ) -> Array:
-    """Returns points (n, 3) in the base frame that are close to the workspace's table."""
+    """Returns a camera's points (n, 3) in the base frame that are over the workspace's table and
+    within `_FARTHEST` of its height."""
     rays = camera.rays
     u, v = (item[::_STEP, ::_STEP] for item in np.broadcast_arrays(rays.u, rays.v))
     z = depth[::_STEP, ::_STEP].astype(float)

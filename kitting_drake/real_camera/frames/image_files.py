@@ -122,9 +122,10 @@ def depth_of_array(data: NDArray[Any], depth_scale: float, what: str) -> NDArray
     """
     if data.ndim == 3 and data.shape[2] == 1:
         data = data[:, :, 0]
+    if data.ndim == 3:
+        raise UserError(f"{what} must have one channel, not {data.shape[2]}")
     if data.ndim != 2:
-        channels = f"one channel, not {data.shape[2]}" if data.ndim == 3 else "rows and columns"
-        raise UserError(f"{what} must have {channels}")
+        raise UserError(f"{what} must have rows and columns, not the shape {data.shape}")
     if np.issubdtype(data.dtype, np.integer):
         return (data * depth_scale).astype(np.float32)
     if not np.issubdtype(data.dtype, np.floating):

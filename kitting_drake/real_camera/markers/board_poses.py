@@ -78,8 +78,9 @@ def fit_board(points: Array, pixels: Array, lens: Intrinsics, where: str) -> Boa
         excess = len(points) * (other_rms**2 - rms**2)
         if turned > _SAME and excess < _CLEARER * max(rms, _LIKELY) ** 2:
             raise UserError(
-                f"{where}: two poses, {math.degrees(turned):.0f} degrees apart, explain the board "
-                "equally well: move it closer, use a larger board, or view it more from the side"
+                f"{where}: two poses of the board, {math.degrees(turned):.0f} degrees apart, "
+                "explain the image equally well: move the board closer, use a larger one, or view "
+                "it more from the side"
             )
     middle = X[:3, :3] @ points.mean(axis=0) + X[:3, 3]
     # The board's z points up, and the line of sight points down.

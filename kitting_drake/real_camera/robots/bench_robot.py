@@ -104,7 +104,10 @@ def read_robot(path: Path) -> BenchRobot:
         raise UserError(f"{path}: model must be {' or '.join(ARM_LIMITS)}, not {model!r}")
     x, y, z = matrix(content.get("base", [0, 0, 0]), 1, 3, f"{path}: base")[0].tolist()
     if max(abs(x), abs(y), abs(z)) > _FARTHEST:
-        raise UserError(f"{path}: base is ({x:g}, {y:g}, {z:g}): give it in metres")
+        raise UserError(
+            f"{path}: base is ({x:g}, {y:g}, {z:g}), more than {_FARTHEST:g} m away: give it in "
+            "metres"
+        )
     yaw = number(content.get("yaw_deg", 0), f"{path}: yaw_deg")
     home = joints = None
     if "home" in content:
