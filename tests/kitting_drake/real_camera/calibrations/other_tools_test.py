@@ -247,7 +247,7 @@ K = "width: 64\n    height: 48\n    k: [50, 0, 31.5, 0, 51, 23.25, 0, 0, 1]\n"
 @pytest.mark.parametrize(
     ("entry", "message"),
     [
-        (K.replace("50, 0", "50, 7.5"), "k has a skew of 7.5 pixels"),
+        (K.replace("50, 0", "50, 7.5"), "skew of 7.5 pixels"),
         (K + "    d: [0.1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0.01, 0]\n", "d has a tilted sensor"),
         (K + "    binning_x: 2\n", "binning_x is 2, so the images are smaller"),
         (K + "    roi: {x_offset: 8, y_offset: 0, width: 32, height: 48}\n", "images are cropped"),

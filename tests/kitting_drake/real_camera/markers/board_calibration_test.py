@@ -265,7 +265,7 @@ def test_a_small_far_tag_is_ambiguous():
     pixels = np.stack(project_points(points @ X_KM[:3, :3].T + X_KM[:3, 3], lens), axis=-1)
     for seed in range(4):
         noisy = pixels + np.random.default_rng(seed).normal(0, 0.3, pixels.shape)
-        with pytest.raises(UserError, match=r"two poses, \d+ degrees apart, explain the board eq"):
+        with pytest.raises(UserError, match=r"two poses .* degrees apart"):
             fit_board(points, noisy, lens, "camera front")
 
 
