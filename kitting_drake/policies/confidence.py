@@ -59,8 +59,8 @@ def read_reliability(policy: str, weights: Path | None = None) -> Reliability:
 
     Args:
         policy: `networks` or `shape_matching`.
-        weights: the networks' file. If a file with the same name and the ending `.confidence.json`
-            lies beside it, that file holds their own regression.
+        weights: the networks' file. If there is a file beside it with the same name and the ending
+            `.confidence.json`, the regression is read from that file.
     """
     own = None if weights is None else weights.with_suffix(".confidence.json")
     return _read(FILE if own is None or not own.exists() else own, policy)
@@ -78,7 +78,7 @@ def _read(path: Path, policy: str) -> Reliability:
 
 
 def evidence_of_networks(observation: Observation, decision: Decision) -> Evidence:
-    """Collects the facts about a decision of the networks that is not a stop."""
+    """Returns the facts about a decision of the networks, which must not be a stop."""
     parts = certainty(decision, observation.grid.resolution)
     return {
         "something_to_pick": float(np.clip(decision.log_odds or 0.0, -8, 8)),
@@ -94,8 +94,8 @@ def evidence_of_networks(observation: Observation, decision: Decision) -> Eviden
 def certainty(decision: Decision, resolution: float) -> dict[str, float]:
     """Returns how certain the networks are of a decision, as numbers from 0 to 1:
 
-    - `something_to_pick` (for a stop, `nothing_to_pick`): the predicted probability that this is
-      so; missing if the networks have no stop class;
+    - `something_to_pick` (for a stop, `nothing_to_pick`): the predicted probability that there is
+      something (or nothing) left to pick; missing if the networks have no stop class;
     - `pick`: the probability of the pixels within 1 cm of the pick, divided by that of the pixels
       within 6 cm, so that other objects do not lower it; missing for a stop;
     - `angle`: the probability of the angles within 10 degrees of the chosen one; missing for a

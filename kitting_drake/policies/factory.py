@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 _LARGEST_RATIO = 3.0
-"""The largest allowed ratio of the sizes of pixels in use and in training, in either direction."""
+"""The largest factor by which pixels may be larger or smaller than in training."""
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,7 @@ class Choice:
     parts: dict[str, float] = field(default_factory=dict)
     """The certainty of the networks, by part; see `certainty`."""
     draw: Draw = _draw_nothing
-    """Draws the decision as a PNG, with a given title. If it is empty, the title is the kind of
+    """Draws the decision as a PNG with a given title; an empty title stands for the kind of
     action."""
     reason: str = ""
     """A sentence that says why the policy acts or stops; empty if `action.reason` says it."""

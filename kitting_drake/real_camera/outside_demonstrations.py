@@ -154,7 +154,10 @@ def check_replaceable(path: Path, folder: Path) -> None:
     except UserError as error:
         raise UserError(f"{path} exists and is not a file of demonstrations: delete it") from error
     if (origin.scenario_name, origin.scenario.get("task")) != (folder.resolve().name, TASK):
-        raise UserError(f"{path} holds demonstrations of {origin.scenario_name}: delete the file")
+        raise UserError(
+            f"{path} holds demonstrations of {origin.scenario_name}, not of "
+            f"{folder.resolve().name}: delete the file"
+        )
 
 
 def convert(folder: Path, calibration: Calibration, learning: Learning, path: Path) -> Summary:

@@ -78,9 +78,10 @@ _RISERS = (0.01, 0.06)
 _MOST_TILT_DEG = 5.0
 """The largest tilt of a kit, in degrees."""
 _FLAT = np.cos(np.radians(2.0))
-"""The cosine of the tilt below which a tool lies flat."""
+"""The cosine of the largest tilt at which a tool lies flat."""
 _ON_TABLE = 0.001
-"""The distance of a tool's origin from the table, in metres, below which the tool lies flat."""
+"""The largest distance of a tool's origin from the table, in metres, at which the tool lies
+flat."""
 _DEFAULT_VIEWS = 0.4
 """The share of scenes that are seen by the default cameras of scenarios."""
 _WALL = 0.003

@@ -98,9 +98,9 @@ class EpisodeFrames:
     action: NDArray[np.float32]
     """(n, entries) commanded positions, in m and rad, at the time of the next frame."""
     reward: NDArray[np.float32]
-    """(n) the task's reward that is earned between each frame and the next frame."""
+    """(n) for each frame, the task's reward that is earned until the next frame."""
     success: NDArray[np.bool_]
-    """(n) whether every goal is filled at the frame after each frame."""
+    """(n) for each frame, whether every goal is filled at the next frame."""
     images: dict[str, list[bytes]] = field(default_factory=dict)
     """For each camera, the PNG of each frame."""
 

@@ -35,7 +35,8 @@ def observed(image: Image, grid: PixelGrid) -> Observation:
     """Makes an observation from a recorded image.
 
     Args:
-        image: (4, rows, cols). In an all-black image unseen pixels have been filled in.
+        image: (4, rows, cols). If it is all black, its unseen pixels must have been filled in, and
+            all pixels count as seen.
         grid: the pixel grid of the image.
     """
     valid = None if image[:3].any() else np.ones(image.shape[1:], bool)

@@ -135,8 +135,8 @@ class Inventory:
     def is_tried(self, region: Region | None) -> bool:
         """Whether an object should not be tried again. For None the result is False.
 
-        An object is not tried again after `_MOST_TRIES` attempts. Neither is one that fits into no
-        recess, if it was already laid aside here.
+        An object is not tried again after `_MOST_TRIES` attempts. An object that fits into no
+        recess is not tried again after it was laid aside here.
         """
         if region is None:
             return False
@@ -208,7 +208,7 @@ class Inventory:
 
 
 def _left_at(attempt: Attempt) -> PlanarPose:
-    """The pose at which an action left its object, as far as the robot knows."""
+    """Returns the pose at which an action left its object, as far as the robot knows."""
     return attempt.action.place if attempt.outcome == "placed" else attempt.action.pick
 
 

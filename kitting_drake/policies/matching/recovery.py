@@ -37,10 +37,11 @@ _ROOM = 0.045
 def recovery_action(
     inventory: Inventory, planner: PickPlaceParameters, tried: Sequence[PlanarPose] = ()
 ) -> PickPlaceAction | None:
-    """The action that corrects the object that protrudes most; None if no object protrudes or no
-    correction is feasible.
+    """Returns an action that presses down or takes out a protruding object; None if no object
+    protrudes or no correction is feasible.
 
-    An object that was already taken out and placed again stays where it is.
+    Higher objects come first. An object that was already taken out and placed again stays where it
+    is.
 
     Args:
         inventory: the objects and recesses of the observation.

@@ -30,8 +30,7 @@ _SUBSAMPLING = 3
 _CLOSING_RADIUS = 0.008
 """Half the width, in metres, below which a notch of an object is missing in its recess."""
 _BAND = 0.006
-"""The largest distance, in metres, from the object's outline of points at which the cost is
-computed."""
+"""The cost is computed at points within this distance, in metres, of the object's outline."""
 _FARTHEST = 0.012
 """Signed distances are clipped to plus or minus this many metres."""
 _ROBUST = 0.002
@@ -180,17 +179,19 @@ def preference(
 ) -> float:
     """Returns how much better the first fit is than the second, where they differ, in metres.
 
-    If an object is rotated by half a turn, most points of its outline coincide with others, and the
-    mean costs of the two fits differ only by noise. So each point is weighted by the difference of
-    the two fits at that point.
+    If a tool is rotated by half a turn, most of its outline looks the same, and the mean costs of
+    the two fits differ only by noise. So each point is weighted by the difference of the two fits
+    at that point.
     """
-    there, away = zip(*(_compared(outline, recess, fit) for fit in (first, second)), strict=True)
+    there, away = zip(
+        *(_compare_outlines(outline, recess, fit) for fit in (first, second)), strict=True
+    )
     telling = np.abs(there[0] - there[1])
     total = float(telling.sum())
     return float((telling * (np.abs(away[1]) - np.abs(away[0]))).sum()) / total if total else 0.0
 
 
-def _compared(outline: Outline, recess: Outline, fit: Registration) -> tuple[Array, Array]:
+def _compare_outlines(outline: Outline, recess: Outline, fit: Registration) -> tuple[Array, Array]:
     """Compares an object's outline, fitted to a recess, with that recess.
 
     Returns:
@@ -199,11 +200,11 @@ def _compared(outline: Outline, recess: Outline, fit: Registration) -> tuple[Arr
         (p,): the first array minus the signed distances of the points from the object's own
             outline.
     """
-    there, offset = _brought(outline, recess, fit)
+    there, offset = _recess_distances(outline, recess, fit)
     return there - offset, there - offset - outline.values
 
 
-def _brought(outline: Outline, recess: Outline, fit: Registration) -> tuple[Array, float]:
+def _recess_distances(outline: Outline, recess: Outline, fit: Registration) -> tuple[Array, float]:
     """Moves an object's points by a fit. Returns their signed distances (p,) from the recess's
     outline, and the offset between the outlines, both in metres."""
     positions = outline.points @ rotation_matrix(fit.rotation).T + fit.shift
@@ -227,7 +228,7 @@ def is_covered(outline: Outline, recess: Outline, fit: Registration) -> bool:
     Distances from points of the recess's outline show that such fits are poor.
     """
     back = (recess.points - fit.shift) @ rotation_matrix(fit.rotation)
-    _, offset = _brought(outline, recess, fit)
+    _, offset = _recess_distances(outline, recess, fit)
     reverse = outline.sample(outline.distance, back, _FARTHEST) - recess.values + offset
     return float(np.abs(reverse).mean()) < _WORST_REVERSE
 

@@ -55,7 +55,8 @@ def blocked_at_place(
         theta: the angle of the gripper at the pick, in radians.
         rotation: the rotation of the object from pick to place, in radians.
         place: (row, col) where the gripper releases the object.
-        planner: the depth of the fingertips, and how far the jaws open at release.
+        planner: parameters that give the depth of the fingertips, and how far the jaws open at
+            release.
     """
     top = _highest(height, pick, resolution, resolution)
     around = _window(height, pick, _SUPPORT_REACH / resolution)

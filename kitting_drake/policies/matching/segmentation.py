@@ -34,7 +34,7 @@ _PLANE_BAND = 0.004
 _LEAST_FIXTURE_HEIGHT = 0.015
 """The least height of a fixture above the table, in metres."""
 _LEAST_FIXTURE_AREA = 0.003
-"""The least area of a fixture, in square metres. It is reduced for small pixels (see
+"""The least area of a fixture, in square metres. The limit is reduced for small pixels (see
 `_AreaLimits`)."""
 _OBJECT_HEIGHT = 0.003
 """The least height of an object above the table, in metres."""
@@ -43,8 +43,8 @@ _RECESS_DEPTH = 0.003
 _PROTRUSION = 0.002
 """The largest height, in metres, by which a seated object rises above the fixture."""
 _LEAST_AREA = 0.0004
-"""The least area of a region, in square metres. Smaller regions are noise. It is reduced for small
-pixels."""
+"""The least area of a region, in square metres. Smaller regions are noise. The limit is reduced for
+small pixels."""
 _LEAST_CLEAN_AREA = 0.00008
 """The least area of an object on a table without noise, in square metres."""
 _LEAST_PROTRUDING = 0.00012
@@ -56,8 +56,8 @@ pixels of any size, so the least areas are reduced for smaller pixels."""
 _CLOSING = 0.0094
 """Half the width, in metres, of the widest gap in a plateau that is closed."""
 _FIXTURE_MARGIN = 0.006
-"""Nothing is an object within this distance, in metres, outside the fixture's outline, and nothing
-is a recess within half this distance inside it."""
+"""No object is found within this distance, in metres, outside the fixture's outline, and no recess
+within half this distance inside it."""
 _CLEAN = 0.0005
 """The largest standard deviation of the noise, in metres, at which heights are not filtered."""
 _CLEARLY = 2.0
@@ -158,7 +158,7 @@ class Segmentation:
 
     @property
     def kit_seen(self) -> bool:
-        """Whether o_t shows a kit: a fixture with recesses, or with objects in them."""
+        """Whether o_t shows a kit: a fixture with recesses or protruding objects."""
         return bool(self.fixture.any()) and bool(self.recesses or self.protruding)
 
     @property
@@ -323,7 +323,7 @@ def _noise_of(
     """Returns the largest of the standard deviations of the noise of the table and of each
     fixture's top, in metres.
 
-    The table's alone may be too small, because heights below the grid are clipped.
+    The table's noise alone may be underestimated, because heights below the grid are clipped.
     """
     tops = [
         _noise((height - _plane_heights(plane, height.shape))[mask]) for mask, plane in fixtures

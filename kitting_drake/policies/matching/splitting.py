@@ -52,7 +52,8 @@ _UNEXPLAINED = 0.15
 """If the objects found in a region leave more than this share of its area, each of them must agree
 clearly (`_CLEARLY`) with the region's outline."""
 _CLEARLY = 0.65
-"""The least share of the outline of an object that agrees clearly with the region's outline."""
+"""An object's outline agrees clearly with the region's outline if at least this share of the
+object's outline is shared."""
 _LEAST_PART = 0.35
 """A region whose area is less than this share of a recess's area contains no object of that
 recess."""

@@ -25,9 +25,9 @@ _MARGIN = 0.010
 _AROUND = 5
 """The side, in pixels, of the square around a pick. More than half of the square must be seen."""
 _LANDING = 0.5
-"""The least share of the area under each finger of the open jaws that must be seen."""
+"""The least share that must be seen of the area under each finger of the open jaws."""
 _SWEPT = 0.5
-"""The least share of the area that the jaws sweep while closing that must be seen."""
+"""The least share that must be seen of the area that the jaws sweep while closing."""
 _LINES, _DEPTHS, _SWEEPS = 5, 4, 17
 """The numbers of samples along the pads, across a finger, and from finger to finger."""
 _INSIDE = 0.9
@@ -37,9 +37,9 @@ _OUT_OF_VIEW = 0.02
 _RING = 3
 """How far the surroundings of a place extend from the object, in pixels."""
 _RING_SEEN = 0.5
-"""The least share of the surroundings of a place that must be seen."""
+"""The least share that must be seen of the surroundings of a place."""
 _PLACE_SEEN = 0.25
-"""The least share of a place that must be seen."""
+"""The least share that must be seen of a place."""
 _BLIND = 0.020
 """The radius that is assumed for an object of unknown outline, in metres."""
 

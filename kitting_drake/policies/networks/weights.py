@@ -118,7 +118,7 @@ def save_weights(path: Path, networks: Networks, card: dict[str, Any]) -> None:
 
 
 def _plain_size(layer: SteerableConv2d) -> int:
-    """The number of entries of a layer's plain kernel."""
+    """Returns the number of entries of a layer's plain kernel."""
     pairs = layer.weights.shape[0] * layer.weights.shape[1]
     return pairs * layer.basis[0].numel()
 
@@ -161,7 +161,7 @@ def load_networks(path: Path, compute_type: torch.dtype = torch.float32) -> Netw
             f"{path}: the weights do not fit a {config.preset} {config.method} network: {first}"
         ) from error
     if not all(bool(value.isfinite().all()) for value in state.values()):
-        raise UserError(f"{path}: the weights must be finite numbers")
+        raise UserError(f"{path}: some weights are not finite numbers: train again")
     networks.stop_threshold = threshold
     networks.freeze(compute_type)
     return networks

@@ -57,7 +57,7 @@ def export_onnx(weights: Path, folder: Path) -> list[Path]:
 
     Each graph maps `image`, prepared as `policy.json` describes, to `output`. The U-nets alpha, phi
     and psi take any sides that are one more than a multiple of 16 pixels; beta takes a crop with
-    sides of `PICK_CROP` pixels. Making crops, rotating them and correlating them is not exported
+    sides of `PICK_CROP` pixels. The steps that make, rotate and correlate crops are not exported
     (see docs/learning.md).
 
     Args:

@@ -19,7 +19,8 @@ from kitting_drake.policies.networks.factored import Networks
 BETAS = (0.9, 0.999)
 
 _STOP_PROBABILITY = 1 / 8
-"""The probability that a training step also learns from a final observation."""
+"""The probability that networks with a stop class also learn from a final observation with a
+sample."""
 
 
 @dataclass(frozen=True)

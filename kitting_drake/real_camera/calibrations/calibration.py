@@ -288,7 +288,7 @@ def _read_color_lens(path: Path, name: str, node: Any, where: str) -> ColorLens:
     """Returns the lens of the colour images, from the field `color` of a camera's entry."""
     label = f"{where}: color"
     if not isinstance(node, dict):
-        raise UserError(f"{label} must have intrinsics and depth_to_color")
+        raise UserError(f"{label} must be a mapping with intrinsics and depth_to_color")
     if "depth_to_color" not in node:
         raise UserError(
             f"{label} lacks depth_to_color: 4 x 4 numbers, or a pose, that map points from the "

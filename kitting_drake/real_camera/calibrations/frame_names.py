@@ -78,8 +78,8 @@ def directed(found: FoundPose, names: FrameNames) -> FoundPose:
     """Returns the pose of the camera in the base or the hand, inverted if the frame names require
     it.
 
-    A pose without frame names is returned unchanged. So is that of a hand-eye calibration, whose
-    file states which pose it is.
+    A pose without frame names is returned unchanged. The pose of a hand-eye calibration is also
+    returned unchanged, because its file states which pose it is.
 
     Raises:
         UserError: the names are ambiguous, or neither frame is a camera.

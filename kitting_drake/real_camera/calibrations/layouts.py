@@ -108,7 +108,7 @@ def _read_pinhole(node: dict[str, Any], where: str) -> tuple[float, float, float
 def _check_cropped(node: dict[str, Any], size: tuple[int, int], where: str) -> None:
     """Raises UserError for a CameraInfo of binned or cropped images.
 
-    Its width, height and k are those of the full image.
+    The width, height and k in such a CameraInfo are those of the full image.
     """
     for key in ("binning_x", "binning_y"):
         if number(node.get(key, 0), f"{where}: {key}") > 1:

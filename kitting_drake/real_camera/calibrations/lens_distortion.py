@@ -35,7 +35,7 @@ _WIDEST = np.deg2rad(85)
 
 
 def known_model(name: object, where: str) -> str:
-    """Returns the model for one of its usual names.
+    """Returns the distortion model that has a given name in ROS, kalibr or OpenCV.
 
     Raises:
         UserError: the name is not that of a model in this module.
@@ -58,7 +58,7 @@ def checked_coefficients(model: str, values: tuple[float, ...], where: str) -> t
         where: the beginning of the error message.
 
     Raises:
-        UserError: the number of coefficients is wrong, or they tilt the sensor.
+        UserError: the number of coefficients is wrong, or they describe a tilted sensor.
     """
     if model != EQUIDISTANT and not any(values):
         return ()
@@ -92,7 +92,8 @@ def distort(x: Array, y: Array, model: str, values: tuple[float, ...]) -> tuple[
 def undistort(
     u: Array, v: Array, model: str, values: tuple[float, ...], name: str
 ) -> tuple[Array, Array]:
-    """Returns the undistorted rays (x, y, 1) that a lens images at (u, v), at depth 1.
+    """Returns x and y of the undistorted rays (x, y, 1) that a lens images at the points (u, v), at
+    depth 1.
 
     Raises:
         UserError: the distortion cannot be inverted at some point. The message names the camera.

@@ -25,7 +25,7 @@ _POSITIONS = ("position", "translation")
 _ROTATIONS = ("orientation", "quaternion_xyzw", "rotation", "rpy_deg", "rvec")
 _MOST_ENVELOPES = 4
 _ENVELOPE = ("header", "child_frame_id", "covariance")
-"""Other keys of ROS messages that contain a pose."""
+"""The other keys of a ROS message in which a pose is nested."""
 
 
 def pose_of_value(value: Any, where: str) -> FoundPose:

@@ -19,8 +19,8 @@ _LEAST_PIXELS = 400
 _CLEAN = 0.0005
 """The noise of heights, in metres, above which the heights are filtered."""
 _LEAST_BAND = 0.001
-"""The least distance from the top's height within which points belong to the top, in metres. Three
-times the noise is used if it is larger."""
+"""Points within this distance of the top's height, in metres, belong to the top. Three times the
+noise is used if that is larger."""
 
 
 @dataclass(frozen=True)
@@ -169,11 +169,14 @@ def _least_rectangle(points: Array) -> Array:
 
 
 def _side_angles(local: Array) -> tuple[float, float]:
-    """Returns by how much a rectangle's sides are rotated from the axes, counter-clockwise in
-    radians.
+    """Measures by how much a rectangle's sides are rotated from the axes.
 
-    Its outline (n, 2) is centred on the origin. The first angle is that of the sides along x, the
-    second that of the sides along y.
+    Args:
+        local: (n, 2) the rectangle's outline, centred on the origin.
+
+    Returns:
+        The angle of the sides along x, counter-clockwise in radians.
+        The angle of the sides along y.
     """
     half = np.abs(local).max(axis=0)
     angles = []

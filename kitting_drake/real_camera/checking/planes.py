@@ -66,7 +66,7 @@ class Plane:
 
 
 def table_points(frame: Frame, camera: BenchCamera, X_BC: Array, calibration: Calibration) -> Array:
-    """Returns the point (height, width, 3) of each pixel in the base frame.
+    """Returns the point (height, width, 3) of each pixel in the base frame, in metres.
 
     It is NaN for pixels without depth, outside the workspace's table, or far above or below the
     table.

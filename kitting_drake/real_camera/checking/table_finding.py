@@ -58,8 +58,8 @@ not part of the table."""
 _TALL = 1.2
 """The height above the table, in metres, above which points are ignored."""
 _CLOSED = 0.035
-"""Half the width, in metres, of the gaps in the table that are closed. They come from objects and
-shadows."""
+"""Half the width, in metres, of the widest gap in the table that is closed. Gaps come from objects
+and shadows."""
 _KIT = 0.03
 """Half the least width, in metres, of an object at the table's edge that counts as part of the
 table. Profiles along the edge are narrower."""

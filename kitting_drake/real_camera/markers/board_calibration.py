@@ -44,7 +44,7 @@ class CalibratedCamera:
 
 @dataclass(frozen=True)
 class Calibrated:
-    """The result for all cameras."""
+    """All cameras after their calibration by a board."""
 
     board: Board
     cameras: tuple[CalibratedCamera, ...]

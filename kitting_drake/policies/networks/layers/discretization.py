@@ -42,7 +42,7 @@ def discretization_matrix(
         raise ValueError(f"frequency {odd[0]} does not exist on SO(2)/C_{quotient}")
     bins = orientations // quotient
     size = sum(2 if j else 1 for j in frequencies)
-    # The band limit, counted within the period of the quotient.
+    # One period of the quotient must have this many bins.
     needed = max(size, 2 * (max(frequencies) // quotient) + 1)
     if bins < needed:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""Steerable convolutions that run as plain ones.
+"""Steerable convolutions, computed as plain convolutions.
 
 A kernel is a linear combination of escnn's basis kernels. The Fourier transforms before and after a
 pointwise nonlinearity are folded into the kernels,
@@ -308,7 +308,7 @@ class BandLimit(nn.Module):
 
 
 class InvariantPart(nn.Module):
-    """Takes the rotation-invariant part of each field, its frequency 0."""
+    """Takes the rotation-invariant part of each field, which is its frequency 0."""
 
     functional: Tensor
 
@@ -346,7 +346,7 @@ def _multiply_fields(features: Tensor, matrix: Tensor) -> Tensor:
 
 
 class BlurPool(nn.Module):
-    """Antialiased pooling to every other pixel, including both outermost ones.
+    """Antialiased pooling to every other pixel, from the first to the last.
 
     A side of 2 n + 1 pixels becomes n + 1, which keeps equivariance to rotations by 90 degrees
     about the image's centre exact.
