@@ -73,7 +73,8 @@ def _read(path: Path, policy: str) -> Reliability:
         return Reliability(record["weights"], record["threshold"])
     except (OSError, ValueError, LookupError, TypeError) as error:
         raise UserError(
-            f"{path} has no valid regression for the policy {policy}: {error}"
+            f"{path} has no valid regression for the policy {policy}: fit it by "
+            "`benchmark reliability --fit`"
         ) from error
 
 

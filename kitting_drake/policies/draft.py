@@ -105,7 +105,7 @@ class Look:
         return failed_pixels(self.observation.grid, self.failed_picks)
 
     def first_logits(self) -> Tensor:
-        """(rows, cols): the logits of the pick, -inf near failed picks."""
+        """Returns the logits (rows, cols) of the pick, which are -inf near failed picks."""
         logits = self.picking.position
         if not self.failed_picks:
             return logits
@@ -175,7 +175,8 @@ class Draft:
         return self.goal + rotation_matrix(self.rotation) @ (self.pick - np.array(self.pixel))
 
     def placement(self, candidate: Candidate) -> tuple[float, Array]:
-        """The rotation in radians and the goal (row, col) of one of the networks' candidates."""
+        """Returns the rotation in radians and the goal (row, col) of one of the networks'
+        candidates."""
         return best_placement(candidate, self.look.orientations, self.continuous)
 
     def among(self, mask: Mask) -> Draft | None:
@@ -217,7 +218,7 @@ def make_draft(look: Look, logits: Tensor, stages: Sequence[Stage]) -> Draft:
 
 
 def near_failed(grid: PixelGrid, failed_picks: Sequence[PlanarPose]) -> Mask:
-    """(rows, cols): the pixels within `RETRY_DISTANCE` of a failed pick."""
+    """Returns a mask (rows, cols) of the pixels within `RETRY_DISTANCE` of a failed pick."""
     rows, cols = np.indices(grid.shape)
     world = grid.to_world(np.stack([rows, cols], axis=-1))
     near = np.zeros(grid.shape, bool)

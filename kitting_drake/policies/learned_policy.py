@@ -143,7 +143,8 @@ class LearnedPolicy:
 
     @torch.inference_mode()
     def log_odds(self, observation: Observation) -> float | None:
-        """The log-odds that there is something to pick; None if the networks do not predict it."""
+        """Returns the log-odds that there is something to pick; None if the networks do not predict
+        it."""
         image = network_input(self._networks, observation, self._resolution)
         return self._networks.predict_pick(image, self._orientations).log_odds
 

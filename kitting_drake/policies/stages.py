@@ -29,7 +29,7 @@ and its place is within `_SAME_PLACE`."""
 _SAME_PLACE = 4.0
 """The largest distance, in pixels, between the places of rotations that count as equally good."""
 _TRIES = 4
-"""The largest number of picks that are tried to find one that is seen well enough."""
+"""The largest number of picks that are checked for being seen well enough."""
 _ANOTHER = 0.010
 """The least distance, in metres, between a pick and the next one that is tried."""
 _NOTHING_FITS = 2.0
@@ -94,8 +94,7 @@ class SubPixel:
 
 @dataclass(frozen=True)
 class JawRoom:
-    """Replaces a grasp at which the jaws have no room by one at which they have room
-    (`refine_grasp`)."""
+    """Replaces a grasp for which the jaws lack room (`refine_grasp`)."""
 
     planner: PickPlaceParameters
 
@@ -292,7 +291,7 @@ class SeenOnly:
         return visibility.place_is_seen(footprint, draft.pick, draft.rotation, draft.place)
 
     def _region(self, draft: Draft) -> Region | None:
-        """The object under the pick; None if the segmentation is not used."""
+        """Returns the object under the pick; None if the segmentation is not used."""
         if not self.outlines:
             return None
         return nearest_region(draft.look.segmentation.objects, draft.pick)

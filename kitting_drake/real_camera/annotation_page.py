@@ -179,8 +179,8 @@ class _Handler(BaseHTTPRequestHandler):
     def _is_local(self) -> bool:
         """Whether the request's Host header names this machine.
 
-        Otherwise a web page of another host could reach this server by a name that points to this
-        machine (DNS rebinding).
+        Other names are refused, because a web page could give this machine another name and so
+        reach this server (DNS rebinding).
         """
         name = self.headers.get("Host", "").split(":")[0]
         return name in (_HOST, "localhost")

@@ -56,12 +56,12 @@ class StepFolder:
 
 @dataclass(frozen=True)
 class Summary:
-    """The counts of a conversion."""
+    """The numbers of demonstrations and observations that `convert` wrote."""
 
     demonstrations: int
     steps: int
     finals: int
-    """The number of demonstrations whose last observation shows that nothing is left to do."""
+    """The number of final observations, in which nothing is left to do."""
 
 
 def find_demonstrations(folder: Path) -> list[list[StepFolder]]:
@@ -170,8 +170,8 @@ def convert(folder: Path, calibration: Calibration, learning: Learning, path: Pa
         path: the file to write.
 
     Raises:
-        UserError: a step has no action or an invalid one, frames are unusable, two demonstrations
-            are the same, or the file cannot be written. The message names the step.
+        UserError: a step has no action or an invalid action, frames are unusable, two
+            demonstrations are the same, or the file cannot be written. The message names the step.
     """
     labelled = [_labelled(steps, calibration) for steps in find_demonstrations(folder)]
     actions = [[action.as_dict() for _, action in steps] for steps in labelled]

@@ -121,7 +121,7 @@ def read_action(step: Path, grid: PixelGrid) -> StepAction:
 
 
 def write_action(step: Path, action: StepAction) -> None:
-    """Writes the action of a step atomically; replaces an existing one.
+    """Writes the action of a step atomically. An existing file is replaced.
 
     Raises:
         UserError: the file cannot be written.

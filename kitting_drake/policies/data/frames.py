@@ -54,7 +54,7 @@ class FrameSettings:
         if self.fps not in RATES:
             raise UserError(f"fps is {self.fps}: use {RATES[0]} to {RATES[-1]}")
         if self.width < 16:
-            raise UserError(f"image_width is {self.width}: use at least 16")
+            raise UserError(f"image_width is {self.width} pixels: use at least 16")
 
     def size(self, width: int, height: int) -> tuple[int, int]:
         """Returns the width and height of the recorded images of a camera, in pixels. They have the

@@ -18,8 +18,8 @@ class Learning:
     labels its earlier observations. True for kitting, false for stacking."""
     curvature: bool = False
     """Whether objects may be bent in the image, as data augmentation for pick angles. This requires
-    that the task's objects differ slightly in shape, and that a bent one is picked in the same way.
-    True for hand tools, false for blocks."""
+    that the task's objects differ slightly in shape, and that a bent object is picked in the same
+    way. True for hand tools, false for blocks."""
     reflection: bool = False
     """Whether the mirror image of a scene is a valid scene of the task, in which the mirrored
     action is right. True for hand tools of many shapes."""

@@ -49,7 +49,7 @@ class ObservedScene:
 
     recorded: Pictured
     actions: tuple[PickPlaceAction, ...]
-    """The actions that the expert may take next. The one that it took comes first."""
+    """The actions that the expert may take next. The action that it took comes first."""
     grid: PixelGrid
 
     @property

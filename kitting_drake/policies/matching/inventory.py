@@ -124,7 +124,7 @@ class Inventory:
         return "nothing fits" if seen.objects and seen.free_recesses else "done"
 
     def pair_of(self, region: Region) -> Pair | None:
-        """The pair of an object and its recess; None if the object fits into no recess."""
+        """Returns the pair of an object and its recess; None if the object fits into no recess."""
         objects = self.segmentation.objects
         return next((pair for pair in self.pairs if objects[pair.item] is region), None)
 
@@ -148,7 +148,8 @@ class Inventory:
         return laid or self.tries(region) >= _MOST_TRIES
 
     def tries(self, region: Region) -> int:
-        """The number of earlier actions that moved this object here, or failed to move it away."""
+        """Returns the number of earlier actions that moved this object here, or failed to move it
+        away."""
         return sum(self._is_there(_left_at(attempt), region) for attempt in self._history)
 
     def was_removed(self, region: Region) -> bool:
@@ -213,7 +214,7 @@ def _left_at(attempt: Attempt) -> PlanarPose:
 
 
 def mask_of(regions: tuple[Region, ...], shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """(rows, cols) mask of the pixels of all regions."""
+    """Returns a mask (rows, cols) of the pixels of all regions."""
     mask = np.zeros(shape, bool)
     for region in regions:
         mask |= region.mask

@@ -1,4 +1,4 @@
-"""Finds grasps of an object at which the jaws hit nothing that o_t shows.
+"""Finds grasps of an object at which the jaws hit no obstacle in o_t.
 
 For each position and angle the heights along the jaws' path are sampled from o_t. Anything above
 the fingertips is either the gripped object or an obstacle. The grasp is centred between the
@@ -60,7 +60,7 @@ class JawGrasp:
 
 
 def failed_pixels(grid: PixelGrid, failed_picks: Sequence[PlanarPose]) -> Array:
-    """(n, 2): the (row, col) of each failed pick."""
+    """Returns the (row, col) of each of n failed picks, (n, 2)."""
     places = np.array([(pick.x, pick.y) for pick in failed_picks]).reshape(-1, 2)
     return grid.to_pixel(places)
 
@@ -256,7 +256,7 @@ def _palm_is_free(
     tip: Array,
     resolution: float,
 ) -> NDArray[np.bool_]:
-    """(n,): whether everything under the palm is lower than the palm.
+    """Returns whether, at each of n grasps, everything under the palm is lower than the palm.
 
     Args:
         raised: (rows, cols), heights above the table, in metres.
@@ -283,13 +283,16 @@ def _palm_is_free(
 
 
 def _run(occupied: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """(n,): in each row, the index of the last True before the first False."""
+    """Returns, for each of n rows, the index of the last True before the first False."""
     free = ~occupied
     ends = free.argmax(axis=1)
     return np.where(free.any(axis=1), ends - 1, occupied.shape[1] - 1)
 
 
 def _slope(u: Array, values: Array) -> Array:
-    """(n,): the least-squares slopes of values (n, lines) over u (lines,); NaN propagates."""
+    """Returns the least-squares slopes (n,) of `values` (n, lines) over `u` (lines,).
+
+    A slope is NaN if one of its values is NaN.
+    """
     centred = u - u.mean()
     return (values * centred).sum(axis=1) / (centred**2).sum()

@@ -213,7 +213,7 @@ def refine_grasp(
 
     Returns the predicted grasp if it is feasible and its cost is not much higher than that of other
     grasps. Otherwise returns another feasible grasp of the same object within 4 cm of the predicted
-    one, or None if there is none.
+    grasp, or None if there is none.
 
     Args:
         segmentation: the segmentation of o_t.

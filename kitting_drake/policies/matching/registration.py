@@ -117,7 +117,7 @@ def trace_outline(mask: Mask, resolution: float, *, close: bool = False) -> Outl
         fine = closed(fine, step)
     outside = ndimage.distance_transform_edt(~fine)
     distance = (outside - ndimage.distance_transform_edt(fine)) * step
-    # The outline lies midway between a pixel inside and one outside.
+    # The outline lies midway between a pixel inside and a pixel outside.
     distance = np.clip(distance - np.sign(distance) * step / 2, -_FARTHEST, _FARTHEST)
     distance = ndimage.gaussian_filter(distance, 1.0).astype(np.float32)
     # Fine pixel (0, 0) lies at a corner of the coarse pixel `corner`.

@@ -1,7 +1,8 @@
 """Segments o_t by height into table, fixture, loose objects and recesses.
 
 It uses neither colour nor a network. The fixture is the largest plateau above the table. Anything
-that rises beside it is a loose object; anything below its top is a recess or a part of one.
+that rises beside the fixture is a loose object; anything below the fixture's top is a recess or a
+part of a recess.
 """
 
 from __future__ import annotations
@@ -64,7 +65,7 @@ _CLEARLY = 2.0
 """A height is not noise if it differs from a plane by more standard deviations than this.
 
 The few noisy pixels that differ by more are isolated. A larger value would cut off the flat ends of
-an object, which are needed to tell its heading from the opposite one.
+an object, which are needed to tell its heading from the opposite heading.
 """
 _OBJECT_SEEN = 0.5
 """The least share of an object's pixels that must be seen."""
@@ -218,8 +219,9 @@ class Segmentation:
     def _is_fragment(self, recess: Region) -> bool:
         """Whether a region is only a fragment of a filled recess.
 
-        An object's top, just below the fixture's top, then covers most of the recess. A slot whose
-        floor no camera sees looks similar, but covers the smaller part of its recess.
+        The larger part of the filled recess then shows the object's top, slightly below the
+        fixture's top. In a free recess, only slots whose floor no camera sees look so shallow, and
+        they are the smaller part.
         """
         if self.noise > _CLEAN:
             return False
@@ -374,7 +376,7 @@ def _fit_table(height: NDArray[np.float32]) -> Plane:
 def _find_fixtures(
     height: NDArray[np.float32], relief: NDArray[np.float32], resolution: float
 ) -> list[_Fixture]:
-    """Finds the largest plateau, and other large ones if they have recesses."""
+    """Finds the largest plateau, and other large plateaus if they have recesses."""
     high = relief > _LEAST_FIXTURE_HEIGHT
     found: list[_Fixture] = []
     largest = 0

@@ -93,7 +93,7 @@ def split_touching(
         resolution: the side of a pixel, in metres.
 
     Returns:
-        The new segmentation; the given one if nothing is split.
+        The new segmentation; the given segmentation if nothing is split.
     """
     objects = segmentation.objects
     matched = {pair.item for pair in pairs}

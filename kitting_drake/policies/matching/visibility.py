@@ -27,7 +27,7 @@ _AROUND = 5
 _LANDING = 0.5
 """The least share that must be seen of the area under each finger of the open jaws."""
 _SWEPT = 0.5
-"""The least share that must be seen of the area that the jaws sweep while closing."""
+"""The least share that must be seen of the area between the fingers of the open jaws."""
 _LINES, _DEPTHS, _SWEEPS = 5, 4, 17
 """The numbers of samples along the pads, across a finger, and from finger to finger."""
 _INSIDE = 0.9
@@ -75,8 +75,8 @@ class Visibility:
         return pickable
 
     def picks_are_seen(self, pixels: Array, thetas: Array, open_width: float) -> Mask:
-        """(n,): whether enough is seen of each pick's surroundings and of the area that the jaws
-        sweep.
+        """Returns whether, for each of n picks, enough is seen of its surroundings and of the area
+        that the jaws sweep.
 
         Args:
             pixels: (n, 2) row and column of each pick.
@@ -105,7 +105,7 @@ class Visibility:
         """Whether enough is seen of the area in which an object will lie, and of its surroundings.
 
         Args:
-            footprint: (n, 2), the pixels of the object where it lies; None if they are unknown.
+            footprint: (n, 2), the object's pixels before the pick; None if they are unknown.
             pick: (row, col) at which the object is gripped.
             rotation: the rotation of the object from pick to place, in radians.
             place: (row, col) to which the gripped point goes.

@@ -27,7 +27,7 @@ def preferred_type() -> torch.dtype:
     float32.
 
     Convolutions in bfloat16 take a fifth of the time with AMX. With AVX-512 alone they take between
-    0.5 and 1.5 times as long, depending on the CPU, so one is timed once per process.
+    0.5 and 1.5 times as long, depending on the CPU, so one convolution is timed in each process.
     """
     if preferred_device().type == "cuda":
         # Below compute capability 8 bfloat16 is emulated and slower.

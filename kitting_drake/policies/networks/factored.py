@@ -123,7 +123,7 @@ class Networks(nn.Module):
                 module.cast(compute_type)
 
     def prepare(self, image: Image) -> Tensor:
-        """Converts an observation, or a crop of one, to a network input.
+        """Converts an observation, or a crop of an observation, to a network input.
 
         Args:
             image: (4, rows, cols), as `Observation.image`.

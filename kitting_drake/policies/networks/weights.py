@@ -247,7 +247,7 @@ def _read(path: Path, *, tensors: bool) -> tuple[dict[str, str], dict[str, Tenso
             reason = "there is no such file"
         raise UserError(f"cannot read the weights {path}: {reason}") from error
     if metadata.get("format") != FORMAT:
-        raise UserError(f"{path} is a safetensors file, but not a policy of this program")
+        raise UserError(f"{path} is not a policy of this program: give a file that `train` wrote")
     if metadata.get("format_version") != str(FORMAT_VERSION):
         raise UserError(
             f"{path} has format version {metadata.get('format_version')}, but this version of "

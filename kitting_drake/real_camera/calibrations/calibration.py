@@ -291,8 +291,8 @@ def _read_color_lens(path: Path, name: str, node: Any, where: str) -> ColorLens:
         raise UserError(f"{label} must be a mapping with intrinsics and depth_to_color")
     if "depth_to_color" not in node:
         raise UserError(
-            f"{label} lacks depth_to_color: 4 x 4 numbers, or a pose, that map points from the "
-            "depth's optical frame to the colour's, in metres"
+            f"{label} lacks depth_to_color: give the transform from the depth's optical frame to "
+            "the colour's, as 4 x 4 numbers or as a pose, in metres"
         )
     check_fields(node, _COLOR_FIELDS, label)
     if any(key in node for key in _LENS_FILES):

@@ -35,7 +35,7 @@ def check_fields(node: dict[str, Any], known: Sequence[str], where: str) -> None
 def check_misspelt(
     node: dict[str, Any], meant: Sequence[str], known: Sequence[str], where: str, likeness: float
 ) -> None:
-    """Raises UserError for an unknown field that resembles an expected one.
+    """Raises UserError for an unknown field that resembles an expected field.
 
     Args:
         node: the fields to check.

@@ -172,7 +172,10 @@ def _realsense_text(
         size = "" if resolution is None else f" of {resolution[0]}x{resolution[1]} pixels"
         sizes = sorted({key.partition(" ")[0] for key in lenses})
         if not lenses:
-            raise UserError(f"{path} has no intrinsics of the stream {wanted}{size}: give another")
+            raise UserError(
+                f"{path} has no intrinsics of the stream {wanted}{size}: give another stream or "
+                "resolution"
+            )
         raise UserError(
             f"{path} has {len(lenses)} intrinsics of the stream {wanted}{size}, for the sizes "
             f"{', '.join(sizes)}: give resolution: [WIDTH, HEIGHT]"

@@ -160,7 +160,7 @@ def _easy_handeye(content: dict[str, Any], where: str) -> FoundPose:
     `parameters`."""
     inner = content.get("parameters", content)
     if not isinstance(inner, dict) or not isinstance(inner.get("eye_on_hand"), bool):
-        raise UserError(f"{where} lacks eye_on_hand: true or false")
+        raise UserError(f"{where} lacks eye_on_hand: give true or false")
     turn, keys = content["transformation"], ("x", "y", "z", "qx", "qy", "qz", "qw")
     if not isinstance(turn, dict):
         raise UserError(f"{where}: transformation must have {', '.join(keys)}")

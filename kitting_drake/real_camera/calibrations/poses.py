@@ -165,7 +165,7 @@ def _hand_pose(node: dict[str, Any], camera: FoundPose, where: str, folder: Path
         return hand.inverse.X
     if kinds != [BASE, HAND]:
         raise UserError(
-            f"{hand.where} is the pose of {hand.child} in {hand.parent}; give the pose of the "
+            f"{hand.where} is the pose of {hand.child} in {hand.parent}: give the pose of the "
             f"hand {camera.parent} in the base"
         )
     if camera.parent and camera.parent.strip("/") not in (

@@ -80,14 +80,17 @@ def see_block(
         noise: the standard deviation of the heights, in metres.
 
     Raises:
-        UserError: the camera does not see such a block.
+        UserError: the camera does not see the block, or another block.
     """
     z = np.where(np.isfinite(points[..., 2]), points[..., 2] - table, -1.0)
     if noise > _CLEAN:
         z = ndimage.median_filter(z, 5)
     near = (z > block.size[2] / 2) & (z < 1.5 * block.size[2] + 0.005)
     if near.sum() < _LEAST_PIXELS:
-        raise UserError(f"camera {camera.name} sees no block {1e3 * block.size[2]:g} mm high")
+        raise UserError(
+            f"camera {camera.name} sees no block {1e3 * block.size[2]:g} mm high: check the height "
+            "of the block, and that it is in view"
+        )
     values = z[near]
     # Use bins of a millimetre. The margin is for the case that all heights are equal.
     low, high = values.min() - 0.002, values.max() + 0.002
@@ -131,10 +134,14 @@ def _filled(mask: NDArray[np.bool_], camera: BenchCamera) -> NDArray[np.bool_]:
     mask = ndimage.binary_opening(mask, iterations=3)
     labels, count = ndimage.label(mask)
     if not count:
-        raise UserError(f"camera {camera.name} sees no block with a flat top")
+        raise UserError(
+            f"camera {camera.name} sees no block with a flat top: check that nothing lies on it"
+        )
     part = labels == np.bincount(labels.ravel())[1:].argmax() + 1
     if part[0].any() or part[-1].any() or part[:, 0].any() or part[:, -1].any():
-        raise UserError(f"camera {camera.name} does not see the whole block")
+        raise UserError(
+            f"camera {camera.name} does not see the whole block: move it to the middle of the image"
+        )
     return part
 
 

@@ -43,7 +43,7 @@ def check_frames(frames: Mapping[str, Frame], calibration: Calibration) -> dict[
         calibration: the cameras' calibration.
 
     Raises:
-        UserError: a camera has no frame, or one of a wrong size or type.
+        UserError: a camera has no frame, or its frame has a wrong size or type.
     """
     checked = {}
     for camera in calibration.cameras:

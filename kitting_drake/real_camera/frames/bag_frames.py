@@ -148,9 +148,9 @@ def _check_registered(
     frames = [str(message.body.header.frame_id) for message in (color, depth)]
     if _REALSENSE.search(depth.topic):
         raise UserError(
-            f"{path} is a RealSense recording, whose depth is not registered to colour: calibrate "
-            "the depth's lens, and add color: with its lens and depth_to_color (as "
-            "rs-enumerate-devices -c prints them)"
+            f"{path} is a RealSense recording, whose depth is not registered to colour: give the "
+            "depth's intrinsics in the calibration, and the colour's intrinsics and depth_to_color "
+            "under color: (rs-enumerate-devices -c prints them)"
         )
     if frames[0] != frames[1]:
         raise UserError(
@@ -203,7 +203,7 @@ def _compare(message: RecordedMessage, lens: Intrinsics, camera: BenchCamera, pa
         if abs(found - value) > limit:
             raise UserError(
                 f"{where} has {name} {found:g}, but camera {camera.name} was calibrated with "
-                f"{value:g}: is the calibration of another lens or resolution?"
+                f"{value:g}: does the calibration belong to another lens or resolution?"
             )
 
 

@@ -121,7 +121,7 @@ def _read(sources: _Sources, camera: BenchCamera) -> Frame:
                 raise UserError(
                     f"{path} has no colours: save it with colours, or give a colour image with it"
                 )
-            # The colours of the cloud are those of its points.
+            # The colours already belong to the points, so they need no registration.
             return Frame(seen, depth)
         return _frame(color, depth, camera, [str(path)] * 2)
     color_path, depth_path = sources

@@ -144,7 +144,7 @@ def _open(path: Path) -> Image.Image:
         raise UserError(f"cannot read {path}: {reason}") from error
     if count > 1:
         image.close()
-        raise UserError(f"{path} holds {count} images: save one alone")
+        raise UserError(f"{path} holds {count} images: save a single image")
     return image
 
 
@@ -160,7 +160,7 @@ def _read_depth_image(path: Path) -> NDArray[Any]:
     with _open(path) as image:
         if image.mode not in _DEPTH_MODES:
             raise UserError(
-                f"{path} is not a depth image, with one channel of 16 bits or of 32-bit floats"
+                f"{path} is not a depth image: give one channel of 16 bits or of 32-bit floats"
             )
         try:
             return np.asarray(image)

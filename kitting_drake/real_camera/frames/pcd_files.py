@@ -40,7 +40,7 @@ def read_pcd(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8] | None,
         raise UserError(f"cannot read {path}: it is not a complete PCD file") from error
     missing = [axis for axis in "xyz" if axis not in table]
     if missing:
-        raise UserError(f"{path} has no field {missing[0]}")
+        raise UserError(f"{path} has no field {missing[0]}: save points with x, y and z")
     if len(viewpoint) != 7 or not np.allclose(viewpoint, _UNMOVED):
         raise UserError(
             f"{path} has a VIEWPOINT other than 0 0 0 1 0 0 0: save the points in the frame of "

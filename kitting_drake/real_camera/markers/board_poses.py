@@ -114,7 +114,8 @@ def _starts(points: Array, pixels: Array, lens: Intrinsics, where: str) -> list[
 
 
 def _refined(start: Array, points: Array, pixels: Array, lens: Intrinsics) -> tuple[Array, float]:
-    """Minimizes the error of a pose from a start; returns the pose and its error in pixels."""
+    """Minimizes the corners' error, from the pose `start` on. Returns the pose found, and its root
+    mean square error in pixels."""
     first = np.concatenate([Rotation.from_matrix(start[:3, :3]).as_rotvec(), start[:3, 3]])
     found = least_squares(_errors, first, args=(points, pixels, lens), method="lm", x_scale="jac")
     X = assembled(Rotation.from_rotvec(found.x[:3]).as_matrix(), found.x[3:6])

@@ -115,7 +115,8 @@ def read_board(path: Path) -> Board:
     needed = columns * rows // 2 if kind == "charuco" else first + columns * rows
     if not 0 <= first <= needed <= held:
         raise UserError(
-            f"{path}: the board needs {needed} markers, but its dictionary has only {held}"
+            f"{path}: the board needs {needed} markers, but its dictionary has only {held}: use a "
+            "larger dictionary"
         )
     try:
         if kind == "charuco":
@@ -205,7 +206,7 @@ def _find_markers(cv2: Any, board: Board, gray: Any) -> tuple[dict[int, Array], 
 
 
 def _centred(cv2: Any, gray: Any, quads: list[Array]) -> list[Array]:
-    """Corrects the corners (4, 2) of markers for the shift of their refinement.
+    """Corrects the corners (4, 2) of markers for the shift that their refinement causes.
 
     OpenCV's AprilTag refinement shifts all corners by about 0.4 pixels. A second refinement, which
     is noisier but has no such bias, shows the exact shift.
@@ -238,7 +239,7 @@ def _dictionary(cv2: Any, content: dict[str, Any], path: Path) -> Any:
     default = "APRILTAG_36h11" if content["type"] == "apriltag" else None
     given = content.get("dictionary", default)
     if given is None:
-        raise UserError(f"{path} lacks 'dictionary', such as 5X5_100")
+        raise UserError(f"{path} lacks 'dictionary': give one, such as 5X5_100")
     wanted = str(given).upper().removeprefix("DICT_").replace("TAG36", "TAG_36")
     names = {name.upper(): name for name in dir(cv2.aruco) if name.startswith("DICT_")}
     name = names.get(f"DICT_{wanted}")

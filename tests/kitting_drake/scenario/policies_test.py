@@ -91,9 +91,7 @@ def test_invalid_weights_and_fields_are_refused(
     gone = f"cannot read the weights {tmp_path}/gone.safetensors: there is no such file"
     assert refusal(weights="gone.safetensors") == gone
     save_file({"weight": torch.zeros(3)}, tmp_path / "other.safetensors")
-    assert "other.safetensors is a safetensors file, but not a policy" in refusal(
-        weights="other.safetensors"
-    )
+    assert "other.safetensors is not a policy" in refusal(weights="other.safetensors")
     assert refusal(weights=str(weights_file), orientations=24).startswith(
         "policy.orientations: 24 orientations alias"
     )

@@ -30,14 +30,16 @@ class Fibre(Protocol):
         """The number of stored channels of one field."""
 
     def synthesis(self) -> NDArray[np.float64]:
-        """(channels, size): maps a vector of the representation to the stored channels."""
+        """Returns the matrix (channels, size) that maps a vector of the representation to the
+        stored channels."""
 
     def analysis(self) -> NDArray[np.float64]:
-        """(size, channels): the left inverse of `synthesis`; it projects onto the irreps."""
+        """Returns the left inverse (size, channels) of `synthesis`, which projects onto the
+        irreps."""
 
     def invariant(self) -> NDArray[np.float64]:
-        """(channels,): weights of the rotation-invariant sum of the channels. The sum is the
-        coefficient of frequency 0, scaled as in escnn's FourierELU."""
+        """Returns the weights (channels,) of the rotation-invariant sum of the channels. The sum is
+        the coefficient of frequency 0, scaled as in escnn's FourierELU."""
 
 
 @dataclass(frozen=True)

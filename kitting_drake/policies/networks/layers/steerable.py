@@ -281,7 +281,7 @@ class MixedPrecision(nn.Module):
     """A network that computes in the type of its input, except for some parts in float32."""
 
     def reduced_precision_parts(self) -> Iterator[nn.Module]:
-        """The submodules that compute in the type of the input."""
+        """Returns the submodules that compute in the type of the input."""
         raise NotImplementedError
 
     def cast(self, compute_type: torch.dtype) -> None:

@@ -258,7 +258,7 @@ K = "width: 64\n    height: 48\n    k: [50, 0, 31.5, 0, 51, 23.25, 0, 0, 1]\n"
         (K + "    camera_to_hand: tf\n", "has pose and camera_to_hand: give only one pose"),
         ("intrinsics: lens\n    camera_info: lens\n", "has camera_info and intrinsics: give one"),
         ("intrinsics: nothing\n", r"cannot read .*nothing: No such file"),
-        (K + "    color: {fx: 3}\n", "color lacks depth_to_color: 4 x 4 numbers"),
+        (K + "    color: {fx: 3}\n", "color lacks depth_to_color"),
         (K + "    color: {depth_to_color: [1], hue: 3}\n", "color has the unknown field 'hue'"),
     ],
 )
