@@ -149,7 +149,7 @@ def open3d_pose(content: dict[str, Any], where: str) -> Array:
     if isinstance(value, list) and any(isinstance(item, list) for item in value):
         raise UserError(
             f"{where}: extrinsic must be a flat list of 16 numbers, column by column, as Open3D "
-            "writes it: give base_to_camera instead"
+            "writes it; for rows of numbers give base_to_camera"
         )
     X = rigid(matrix(value, 4, 4, f"{where}: extrinsic").T, f"{where}: extrinsic")
     return np.asarray(np.linalg.inv(X), dtype=float)

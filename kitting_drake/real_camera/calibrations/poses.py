@@ -85,7 +85,7 @@ def read_pose(node: dict[str, Any], where: str, folder: Path) -> Array:
 
 
 def _given_pose(node: dict[str, Any], where: str, folder: Path) -> FoundPose:
-    """Returns the only pose in a camera's entry."""
+    """Returns the pose in a camera's entry. Raises UserError unless there is exactly one pose."""
     given = [key for key in (*_OPENCV, *_POSES) if key in node]
     for turn, position in _OPENCV.items():
         if position in node and turn not in node:

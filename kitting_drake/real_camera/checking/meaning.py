@@ -196,11 +196,8 @@ def scales(seen: SeenBlock, block: Block) -> tuple[float, float, float]:
 
 
 def offset(seen: SeenBlock, block: Block) -> tuple[float, float, float] | None:
-    """Returns the apparent displacement of a block whose pose is known.
-
-    It is x and y in metres and yaw in radians, modulo `Block.period`; None if the pose is not
-    known.
-    """
+    """Returns how far a block seems to be from its true pose: x and y in metres, and yaw in
+    radians, modulo `Block.period`. Returns None if the true pose is not known."""
     if block.pose is None:
         return None
     x, y = seen.middle - np.array(block.pose[:2])
