@@ -68,7 +68,8 @@ def find_demonstrations(folder: Path) -> list[list[StepFolder]]:
     """Returns the steps of each demonstration, in the natural order of their names.
 
     Args:
-        folder: a folder with a folder for each demonstration, which has a folder for each step.
+        folder: it holds a folder for each demonstration, which in turn holds a folder for each
+            step.
 
     Raises:
         UserError: there is no demonstration, or one has no steps.

@@ -205,7 +205,7 @@ class Segmentation:
         return np.asarray(taken)
 
     def _is_wide(self, recess: Region) -> bool:
-        """Whether a recess is wider than the gap around an object, and seen."""
+        """Whether a recess is seen, and wider than the gap around an object."""
         return bool(
             _inner_radius(recess.mask) > max(_GAP, _LEAST_GAP / self.visibility.resolution)
             and self.visibility.seen[recess.mask].mean() > _RECESS_SEEN
