@@ -275,7 +275,7 @@ def test_saves_a_picture_of_each_decision(
     [
         (None, "cannot read the weights {weights}: there is no such file"),
         ("text", "cannot read the weights {weights}: it is not a complete safetensors file"),
-        ("foreign", "{weights} is not a policy of this program"),
+        ("foreign", "{weights} is not a policy of this program: give a file that `train` wrote"),
     ],
 )
 @pytest.mark.usefixtures("rendering")
