@@ -173,8 +173,8 @@ def _points(
 def _is_range(
     camera: BenchCamera, depth: NDArray[np.float32], calibration: Calibration, fit: TableFit
 ) -> bool:
-    """Whether the depths seem to be distances from the camera, because the table is flat only after
-    they are converted to depths along the optical axis."""
+    """Whether the depths seem to be distances from the camera. Converted to depths along the
+    optical axis, they then show a much flatter table."""
     if fit.plane.noise < _FLAT:
         return False
     points = _points(camera, camera.X_BC, _as_depth(camera, depth), calibration)
