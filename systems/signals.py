@@ -122,11 +122,12 @@ class Observation:
 
 _FILL_REACH = 25
 """A hole is filled from neighbours at most this far away, in pixels."""
-_SMALL_HOLE = 4
-"""All of a hole of at most this many pixels gets the height of its lowest neighbour."""
+_SHADOW = np.ones((3, 3), bool)
+"""A hole into which this square fits may be the shadow of an object. Narrower ones are gaps between
+the points of a camera."""
 _HIDDEN_BELOW = 0.005
-"""A neighbour of a hole that is higher than this above the hole's lowest neighbours may be what
-hides the hole, in metres."""
+"""A neighbour of a shadow that is higher than this above its lowest neighbour may be what hides it,
+in metres."""
 
 
 def fill_unseen(
@@ -136,9 +137,10 @@ def fill_unseen(
 ) -> NDArray[np.float32]:
     """Fills the heights of unseen pixels.
 
-    A hidden surface is lower than the surface that hides it. So a pixel of a hole gets the height
-    of the nearest seen pixel among the lowest ones around the hole. Pixels outside all views, or
-    deep in a large hole, get the table's height, zero, because nothing is known about them.
+    A hidden surface is lower than the surface that hides it. So a pixel of a wide hole gets the
+    height of the nearest seen pixel among the lowest ones around the hole. A narrow hole is filled
+    with the lowest neighbour, from its border inwards. Pixels outside all views, or deep in a large
+    hole, get the table's height, zero, because nothing is known about them.
 
     Args:
         height: (rows, cols), in metres above the table.
@@ -150,27 +152,39 @@ def fill_unseen(
     # Import SciPy lazily.
     from scipy import ndimage
 
+    filled = np.where(valid, height, np.inf).astype(np.float32)
     holes = ~valid if in_view is None else ~valid & in_view
-    labels, count = ndimage.label(holes, np.ones((3, 3), bool))
-    seen = np.where(valid, height, np.inf)
-    beside = ndimage.minimum_filter(seen, size=3, mode="nearest")
-    lowest = np.full(count + 1, np.inf)
-    np.minimum.at(lowest, labels, beside)
-    filled = np.where(valid, height, np.where(holes, lowest[labels], 0.0))
-    sizes = np.bincount(labels.ravel())
+    _fill_shadows(filled, ndimage.binary_opening(holes, _SHADOW))
+    for _ in range(_FILL_REACH):
+        missing = holes & ~np.isfinite(filled)
+        if not missing.any():
+            break
+        lowest = ndimage.minimum_filter(filled, size=3, mode="nearest")
+        filled = np.where(missing, lowest, filled)
+    return np.where(np.isfinite(filled), filled, np.float32(0))
+
+
+def _fill_shadows(filled: NDArray[np.float32], shadows: NDArray[np.bool_]) -> None:
+    """Fills wide holes in place.
+
+    Args:
+        filled: (rows, cols) heights in metres, infinite where unknown.
+        shadows: (rows, cols) mask of the wide holes.
+    """
+    from scipy import ndimage
+
+    seen = filled.copy()
+    labels, _ = ndimage.label(shadows, np.ones((3, 3), bool))
     for label, place in enumerate(ndimage.find_objects(labels), 1):
-        if sizes[label] <= _SMALL_HOLE:
-            continue
-        rows, cols = (slice(max(part.start - 1, 0), part.stop + 1) for part in place)
-        hole = labels[rows, cols] == label
-        around = seen[rows, cols]
-        low = ndimage.binary_dilation(hole, np.ones((3, 3), bool)) & (
-            around <= lowest[label] + _HIDDEN_BELOW
-        )
-        away, nearest = ndimage.distance_transform_edt(~low, return_indices=True)
-        heights = np.where(away <= _FILL_REACH, around[tuple(nearest)], 0.0)
-        filled[rows, cols][hole] = heights[hole]
-    return np.where(np.isfinite(filled), filled, 0.0).astype(np.float32)
+        # Gaps may lie between a shadow and the nearest seen pixels.
+        rows, cols = (slice(max(part.start - 2, 0), part.stop + 2) for part in place)
+        shadow, around = labels[rows, cols] == label, seen[rows, cols]
+        border = ndimage.binary_dilation(shadow, _SHADOW, iterations=2) & np.isfinite(around)
+        if border.any():
+            low = border & (around <= around[border].min() + _HIDDEN_BELOW)
+            away, nearest = ndimage.distance_transform_edt(~low, return_indices=True)
+            heights = np.where(away <= _FILL_REACH, around[tuple(nearest)], np.inf)
+            filled[rows, cols][shadow] = heights[shadow]
 
 
 @dataclass(frozen=True)
