@@ -18,7 +18,7 @@ from torch import Tensor
 from kitting_drake.policies.data.images import Image, rotation_matrix
 from kitting_drake.policies.matching.inventory import Inventory
 from kitting_drake.policies.matching.jaw_clearance import RETRY_DISTANCE, failed_pixels
-from kitting_drake.policies.matching.segmentation import Segmentation
+from kitting_drake.policies.matching.regions.segmentation import Segmentation
 from kitting_drake.policies.networks.factored import AnglePrediction, Networks, PlacePrediction
 from kitting_drake.policies.networks.layers.correlation import Candidate
 from systems.signals import (

@@ -16,10 +16,10 @@ from kitting_drake.policies.draft import Draft, Stage, expected_position
 from kitting_drake.policies.matching.inventory import mask_of
 from kitting_drake.policies.matching.recovery import recovery_action
 from kitting_drake.policies.matching.refinement import nearest_region, refine_grasp, refine_place
+from kitting_drake.policies.matching.regions.segmentation import Region
+from kitting_drake.policies.matching.regions.visibility import Visibility
 from kitting_drake.policies.matching.release_clearance import blocked_at_place
-from kitting_drake.policies.matching.segmentation import Region
 from kitting_drake.policies.matching.separating import separating_action, turning_action
-from kitting_drake.policies.matching.visibility import Visibility
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import wrap_to_pi
 

@@ -20,7 +20,7 @@ from kitting_drake.common.errors import UserError
 from kitting_drake.policies.factory import load_learned_policy
 from kitting_drake.policies.matching.inventory import Inventory
 from kitting_drake.policies.matching.recovery import recovery_action
-from kitting_drake.policies.matching.segmentation import segment
+from kitting_drake.policies.matching.regions.segmentation import segment
 from kitting_drake.real_camera import Frame, ShapeMatching, decide, load_policy, read_frames
 from kitting_drake.real_camera.calibrations.calibration import (
     Calibration,

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from kitting_drake.policies.matching.regions.segmentation import Region, Segmentation
 from kitting_drake.policies.matching.registration import (
     Registration,
     coarse_cost,
@@ -16,7 +17,6 @@ from kitting_drake.policies.matching.registration import (
     register,
     trace_outline,
 )
-from kitting_drake.policies.matching.segmentation import Region, Segmentation
 
 _WORST_COST = 0.0019
 """The largest mismatch, in metres, of an object and a recess into which it fits."""

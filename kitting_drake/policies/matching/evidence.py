@@ -9,7 +9,7 @@ from scipy import ndimage
 
 from kitting_drake.policies.data.images import rotation_matrix
 from kitting_drake.policies.matching.refinement import nearest_region
-from kitting_drake.policies.matching.segmentation import Segmentation
+from kitting_drake.policies.matching.regions.segmentation import Segmentation
 
 Array = NDArray[np.float64]
 

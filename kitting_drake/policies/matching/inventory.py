@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kitting_drake.policies.matching.assignment import Pair, match, reversed_objects
-from kitting_drake.policies.matching.segmentation import Region, Segmentation, segment
+from kitting_drake.policies.matching.regions.segmentation import Region, Segmentation, segment
 from kitting_drake.policies.matching.splitting import split_touching
 from systems.signals import Attempt, LeftOver, Observation, PlanarPose
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from kitting_drake.policies.matching.segmentation import Region, Segmentation
+from kitting_drake.policies.matching.regions.segmentation import Region, Segmentation
 from systems.hand_geometry import FINGERTIP_DEPTH, PAD_LENGTH, PALM_HEIGHT, PALM_SIZE
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import PixelGrid, PlanarPose

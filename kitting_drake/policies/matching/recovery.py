@@ -18,7 +18,7 @@ from scipy import ndimage
 from kitting_drake.policies.data.images import make_action
 from kitting_drake.policies.matching.inventory import Inventory
 from kitting_drake.policies.matching.jaw_clearance import jaw_grasps
-from kitting_drake.policies.matching.segmentation import Mask, Region, Segmentation
+from kitting_drake.policies.matching.regions.segmentation import Mask, Region, Segmentation
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import Observation, PickPlaceAction, PlanarPose
 

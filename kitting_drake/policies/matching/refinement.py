@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from kitting_drake.policies.data.images import rotation_matrix
 from kitting_drake.policies.matching.assignment import Pair
 from kitting_drake.policies.matching.jaw_clearance import JawGrasp, jaw_grasps, untried
+from kitting_drake.policies.matching.regions.segmentation import Region, Segmentation
 from kitting_drake.policies.matching.registration import (
     Outline,
     Registration,
@@ -29,7 +30,6 @@ from kitting_drake.policies.matching.registration import (
     register,
     trace_outline,
 )
-from kitting_drake.policies.matching.segmentation import Region, Segmentation
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import wrap_to_pi
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from kitting_drake.policies.data.images import rotation_matrix
-from kitting_drake.policies.matching.segmentation import Mask, Region
+from kitting_drake.policies.matching.regions.segmentation import Mask, Region
 
 Array = NDArray[np.float64]
 

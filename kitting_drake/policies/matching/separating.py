@@ -19,7 +19,7 @@ from scipy.spatial import ConvexHull
 from kitting_drake.policies.data.images import make_action, rotation_matrix
 from kitting_drake.policies.matching.inventory import Inventory
 from kitting_drake.policies.matching.jaw_clearance import failed_pixels, jaw_grasps, untried
-from kitting_drake.policies.matching.segmentation import Region, Segmentation
+from kitting_drake.policies.matching.regions.segmentation import Region, Segmentation
 from systems.ledge import Ledge, moved_gripper
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import PickPlaceAction, PixelGrid, PlanarPose

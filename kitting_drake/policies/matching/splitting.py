@@ -17,6 +17,7 @@ from scipy import fft, ndimage
 
 from kitting_drake.policies.data.images import rotation_matrix
 from kitting_drake.policies.matching.assignment import Pair
+from kitting_drake.policies.matching.regions.segmentation import Mask, Region, Segmentation
 from kitting_drake.policies.matching.registration import (
     Outline,
     Registration,
@@ -25,7 +26,6 @@ from kitting_drake.policies.matching.registration import (
     residuals,
     trace_outline,
 )
-from kitting_drake.policies.matching.segmentation import Mask, Region, Segmentation
 
 Array = NDArray[np.float64]
 

@@ -24,7 +24,7 @@ _LEVEL = math.radians(0.02)
 """The tilt, in radians, below which a table counts as level."""
 _CLEAN = 0.0005
 """The noise, in metres, above which heights are filtered (see
-`policies/matching/segmentation.py`)."""
+`policies/matching/regions/segmentation.py`)."""
 _NOISY = 0.0016
 """The noise, in metres, above which details of 3 mm are lost."""
 _LOST = 1.8

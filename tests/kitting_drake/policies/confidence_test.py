@@ -9,7 +9,7 @@ from kitting_drake.policies.confidence import read_reliability
 from kitting_drake.policies.matching.shape_matching import ShapeMatchingPolicy
 from kitting_drake.reproduction.benchmarks.reliability import Judged, fit, summarize
 from systems.pick_place_parameters import PickPlaceParameters
-from tests.kitting_drake.policies.matching.visibility_test import kit_and_bar
+from tests.kitting_drake.policies.matching.regions.visibility_test import kit_and_bar
 
 
 def drawn(seed: int, count: int = 2000) -> list[Judged]:

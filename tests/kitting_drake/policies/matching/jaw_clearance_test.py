@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kitting_drake.policies.matching.jaw_clearance import jaw_grasps, tip_height
-from kitting_drake.policies.matching.segmentation import segment
+from kitting_drake.policies.matching.regions.segmentation import segment
 from systems.motion_heights import motion_heights
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import Observation, PixelGrid, SurfaceHeights

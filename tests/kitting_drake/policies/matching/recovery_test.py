@@ -5,7 +5,7 @@ import pytest
 
 from kitting_drake.policies.matching.inventory import Inventory
 from kitting_drake.policies.matching.recovery import recovery_action
-from kitting_drake.policies.matching.segmentation import segment
+from kitting_drake.policies.matching.regions.segmentation import segment
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import Observation, PixelGrid
 

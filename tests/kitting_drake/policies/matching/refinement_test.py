@@ -5,7 +5,7 @@ import pytest
 
 from kitting_drake.policies.matching.jaw_clearance import jaw_grasps
 from kitting_drake.policies.matching.refinement import refine_grasp
-from kitting_drake.policies.matching.segmentation import Segmentation, segment
+from kitting_drake.policies.matching.regions.segmentation import Segmentation, segment
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import Observation, PixelGrid
 

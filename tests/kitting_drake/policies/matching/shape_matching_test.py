@@ -13,7 +13,7 @@ from kitting_drake.policies.data.images import rotation_matrix
 from kitting_drake.policies.learned_policy import LearnedPolicy
 from kitting_drake.policies.matching.assignment import match
 from kitting_drake.policies.matching.refinement import refine_grasp, refine_place
-from kitting_drake.policies.matching.segmentation import segment
+from kitting_drake.policies.matching.regions.segmentation import segment
 from kitting_drake.policies.matching.shape_matching import ShapeMatchingPolicy
 from kitting_drake.policies.networks.factored import Networks
 from kitting_drake.policies.networks.weights import load_networks

@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from kitting_drake.policies.matching.segmentation import segment
+from kitting_drake.policies.matching.regions.segmentation import segment
+from kitting_drake.policies.matching.regions.visibility import Visibility
 from kitting_drake.policies.matching.shape_matching import ShapeMatchingPolicy
-from kitting_drake.policies.matching.visibility import Visibility
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import Observation, PixelGrid
 

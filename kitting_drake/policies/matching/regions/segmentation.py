@@ -7,60 +7,36 @@ part of a recess.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
-from scipy.spatial import ConvexHull, QhullError
 
-from kitting_drake.policies.matching.visibility import Visibility
+from kitting_drake.policies.matching.regions.fixtures import (
+    CLEAN,
+    LEAST_AREA,
+    NEIGHBOURS,
+    PLANE_BAND,
+    RECESS_DEPTH,
+    AreaLimits,
+    Fixture,
+    Mask,
+    find_fixtures,
+    fit_table,
+    plane_heights,
+)
+from kitting_drake.policies.matching.regions.visibility import Visibility
 from systems.signals import Observation
 
-Mask = NDArray[np.bool_]
-Plane = NDArray[np.float64]
-"""(3,): the height at (row, col) is `plane @ (row, col, 1)`, in metres."""
-
-_Fixture = tuple[Mask, Plane]
-"""The convex hull of a fixture (rows, cols), and the plane of its top."""
-
-_MOST_FIXTURES = 4
-"""The largest number of fixtures."""
-_COMPARABLE = 0.3
-"""The least area of a further fixture, as a share of the largest fixture's area."""
-_PLANE_BAND = 0.004
-"""The largest distance, in metres, from a plane at which a pixel belongs to it."""
-_LEAST_FIXTURE_HEIGHT = 0.015
-"""The least height of a fixture above the table, in metres."""
-_LEAST_FIXTURE_AREA = 0.003
-"""The least area of a fixture, in square metres. The limit is reduced for small pixels (see
-`_AreaLimits`)."""
 _OBJECT_HEIGHT = 0.003
 """The least height of an object above the table, in metres."""
-_RECESS_DEPTH = 0.003
-"""The least depth of a recess below the fixture's top, in metres."""
 _PROTRUSION = 0.002
 """The largest height, in metres, by which a seated object rises above the fixture."""
-_LEAST_AREA = 0.0004
-"""The least area of a region, in square metres. Smaller regions are noise. The limit is reduced for
-small pixels."""
-_LEAST_CLEAN_AREA = 0.00008
-"""The least area of an object on a table without noise, in square metres."""
-_LEAST_PROTRUDING = 0.00012
-"""The least area of a protruding object, in square metres. It is small, because an object may
-protrude only at one end."""
-_USUAL_PIXEL = 0.003125
-"""The side of the pixels, in metres, for which the least areas are chosen. Noise affects a few
-pixels of any size, so the least areas are reduced for smaller pixels."""
-_CLOSING = 0.0094
-"""Half the width, in metres, of the widest gap in a plateau that is closed."""
 _FIXTURE_MARGIN = 0.006
 """No object is found within this distance, in metres, outside the fixture's outline, and no recess
 within half this distance inside it."""
-_CLEAN = 0.0005
-"""The largest standard deviation of the noise, in metres, at which heights are not filtered."""
 _CLEARLY = 2.0
 """A height is not noise if it differs from a plane by more standard deviations than this.
 
@@ -86,36 +62,7 @@ _BELOW_TOP = 0.001
 _NOISY = 0.001
 """The standard deviation of the noise, in metres, above which an object in a recess cannot be
 distinguished from the recess's floor."""
-_LEVEL = math.tan(math.radians(0.7))
-"""The slope below which a plateau counts as level."""
-_TILT_ROUNDS = 3
-"""The number of rounds in which a tilted plateau is extended along its slope."""
-_NEIGHBOURS = np.ones((3, 3), bool)
 _CROSS = ndimage.generate_binary_structure(2, 1)
-
-
-@dataclass(frozen=True)
-class _AreaLimits:
-    """The least areas of regions that are not noise, in square metres."""
-
-    fixture: float
-    recess: float
-    object: float
-    protruding: float
-
-    @classmethod
-    def of(cls, resolution: float, noise: float = math.inf) -> _AreaLimits:
-        """Returns the limits for pixels with the side `resolution` and heights with the standard
-        deviation `noise`, both in metres."""
-        scale = min(1.0, (resolution / _USUAL_PIXEL) ** 2)
-        least = scale * _LEAST_AREA
-        clean = noise <= _CLEAN
-        return cls(
-            fixture=scale * _LEAST_FIXTURE_AREA,
-            recess=least,
-            object=min(least, _LEAST_CLEAN_AREA) if clean else least,
-            protruding=scale * _LEAST_PROTRUDING,
-        )
 
 
 @dataclass(frozen=True)
@@ -183,7 +130,7 @@ class Segmentation:
         These are the `free_recesses` and the narrow recesses. If there is noise, they are all
         recesses, because an object in a recess may then look like the recess's floor.
         """
-        if self.noise > _CLEAN:
+        if self.noise > CLEAN:
             return self.recesses
         return tuple(
             item
@@ -214,7 +161,7 @@ class Segmentation:
     @cached_property
     def _low(self) -> NDArray[np.int32]:
         """(rows, cols): labels of the connected parts of the fixture below its top."""
-        return np.asarray(ndimage.label(self.depth > _BELOW_TOP, _NEIGHBOURS)[0])
+        return np.asarray(ndimage.label(self.depth > _BELOW_TOP, NEIGHBOURS)[0])
 
     def _is_fragment(self, recess: Region) -> bool:
         """Whether a region is only a fragment of a filled recess.
@@ -223,12 +170,12 @@ class Segmentation:
         fixture's top. In a free recess, only slots whose floor no camera sees look so shallow, and
         they are the smaller part.
         """
-        if self.noise > _CLEAN:
+        if self.noise > CLEAN:
             return False
         labels = np.unique(self._low[recess.mask])
         reach = max(2, round(_FIXTURE_MARGIN / self.visibility.resolution))
-        near = ndimage.binary_dilation(recess.mask, _NEIGHBOURS, iterations=reach)
-        beside = np.isin(self._low, labels[labels > 0]) & (self.depth < _RECESS_DEPTH) & ~near
+        near = ndimage.binary_dilation(recess.mask, NEIGHBOURS, iterations=reach)
+        beside = np.isin(self._low, labels[labels > 0]) & (self.depth < RECESS_DEPTH) & ~near
         return bool(beside.sum() > recess.mask.sum())
 
     def _is_flat(self, recess: Region) -> bool:
@@ -254,21 +201,21 @@ def segment(observation: Observation) -> Segmentation:
     """
     resolution = observation.grid.resolution
     height = observation.filled_height
-    table = _fit_table(height)
-    relief = (height - _plane_heights(table, height.shape)).astype(np.float32)
-    fixtures = _find_fixtures(height, relief, resolution)
+    table = fit_table(height)
+    relief = (height - plane_heights(table, height.shape)).astype(np.float32)
+    fixtures = find_fixtures(height, relief, resolution)
     noise = _noise_of(height, relief, fixtures)
-    if noise > _CLEAN:
+    if noise > CLEAN:
         # A median filter erases details one pixel wide, so use it only on noisy heights.
         height = ndimage.median_filter(height, footprint=_CROSS, mode="nearest")
         relief = ndimage.median_filter(relief, footprint=_CROSS, mode="nearest")
-        fixtures = _find_fixtures(height, relief, resolution)
+        fixtures = find_fixtures(height, relief, resolution)
         noise = _noise_of(height, relief, fixtures)
-    margin, areas = _FIXTURE_MARGIN / resolution, _AreaLimits.of(resolution, noise)
+    margin, areas = _FIXTURE_MARGIN / resolution, AreaLimits.of(resolution, noise)
     fixture = np.zeros(relief.shape, bool)
     depth = np.zeros_like(relief)
     for mask, top in fixtures:
-        depth[mask] = (_plane_heights(top, height.shape) - height)[mask]
+        depth[mask] = (plane_heights(top, height.shape) - height)[mask]
         fixture |= mask
     least = max(_OBJECT_HEIGHT, _CLEARLY * noise)
     loose = relief > least
@@ -280,7 +227,7 @@ def segment(observation: Observation) -> Segmentation:
         depth[~inside] = 0
         # Add each unseen region to the recess that it touches.
         hidden = inside & ~observation.valid
-    deep = depth > max(_RECESS_DEPTH, _CLEARLY * noise)
+    deep = depth > max(RECESS_DEPTH, _CLEARLY * noise)
     return Segmentation(
         fixture=fixture,
         objects=tuple(
@@ -308,7 +255,7 @@ def segment(observation: Observation) -> Segmentation:
 def _is_corner(item: Region, fixture: Mask, top: float, resolution: float) -> bool:
     """Whether a small region is a corner of the fixture that the fixture's convex hull does not
     include."""
-    if item.mask.sum() * resolution**2 >= _LEAST_AREA or item.height < top - _PLANE_BAND:
+    if item.mask.sum() * resolution**2 >= LEAST_AREA or item.height < top - PLANE_BAND:
         return False
     near = ndimage.binary_dilation(item.mask, iterations=round(2 * _FIXTURE_MARGIN / resolution))
     return bool((near & fixture).any())
@@ -320,147 +267,22 @@ def _inner_radius(mask: Mask) -> float:
 
 
 def _noise_of(
-    height: NDArray[np.float32], relief: NDArray[np.float32], fixtures: list[_Fixture]
+    height: NDArray[np.float32], relief: NDArray[np.float32], fixtures: list[Fixture]
 ) -> float:
     """Returns the largest of the standard deviations of the noise of the table and of each
     fixture's top, in metres.
 
     The table's noise alone may be underestimated, because heights below the grid are clipped.
     """
-    tops = [
-        _noise((height - _plane_heights(plane, height.shape))[mask]) for mask, plane in fixtures
-    ]
+    tops = [_noise((height - plane_heights(plane, height.shape))[mask]) for mask, plane in fixtures]
     return max([_noise(relief), *tops])
 
 
 def _noise(relief: NDArray[np.floating]) -> float:
     """Returns a robust estimate of the standard deviation of heights, in metres, from their
     distances to a plane on which most of them lie."""
-    flat = np.abs(relief[np.abs(relief) < 3 * _PLANE_BAND])
+    flat = np.abs(relief[np.abs(relief) < 3 * PLANE_BAND])
     return 1.4826 * float(np.median(flat)) if flat.size else 0.0
-
-
-def _plane_heights(plane: Plane, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    return plane[0] * np.arange(shape[0])[:, None] + plane[1] * np.arange(shape[1]) + plane[2]
-
-
-def _fit_plane(height: NDArray[np.float32], start: float, where: Mask) -> Plane:
-    """Fits a plane to most pixels of the mask `where`, by three rounds of least squares on inliers.
-    The first round starts from a level plane at the height `start`, in metres."""
-    plane = np.array([0.0, 0.0, start])
-    rows, cols = np.nonzero(where)
-    design = np.column_stack([rows, cols, np.ones(len(rows))])
-    values = height[rows, cols]
-    for band in (2 * _PLANE_BAND, _PLANE_BAND, _PLANE_BAND):
-        near = np.abs(values - design @ plane) < band
-        if near.sum() < 100:
-            break
-        plane = np.linalg.lstsq(design[near], values[near], rcond=None)[0]
-    return plane
-
-
-def _mode(values: NDArray[np.float32]) -> float:
-    """Returns the most frequent height, in metres."""
-    width = 0.001
-    low = float(values.min())
-    counts = np.bincount(((values - low) / width).astype(int))
-    smooth = np.convolve(counts, np.ones(5), "same")
-    return low + (int(smooth.argmax()) + 0.5) * width
-
-
-def _fit_table(height: NDArray[np.float32]) -> Plane:
-    low = height[height <= np.median(height)]
-    return _fit_plane(height, _mode(low), np.ones(height.shape, bool))
-
-
-def _find_fixtures(
-    height: NDArray[np.float32], relief: NDArray[np.float32], resolution: float
-) -> list[_Fixture]:
-    """Finds the largest plateau, and other large plateaus if they have recesses."""
-    high = relief > _LEAST_FIXTURE_HEIGHT
-    found: list[_Fixture] = []
-    largest = 0
-    for _ in range(_MOST_FIXTURES):
-        fixture = _find_fixture(height, relief, high, resolution)
-        if fixture is None:
-            break
-        mask, plane = fixture
-        size = int(mask.sum())
-        if found:
-            depth = _plane_heights(plane, height.shape) - height
-            if size < _COMPARABLE * largest or not _has_recess(mask, depth, resolution):
-                break
-        largest = max(largest, size)
-        found.append(fixture)
-        high = high & ~ndimage.binary_dilation(mask, iterations=2)
-    return found
-
-
-def _has_recess(fixture: Mask, depth: NDArray[np.float64], resolution: float) -> bool:
-    """Whether a fixture encloses a recess on all sides.
-
-    A low area within the convex hull of a tool is no recess: it is open on a side.
-    """
-    labels, count = ndimage.label(fixture & (depth > _RECESS_DEPTH), _NEIGHBOURS)
-    sizes = np.bincount(labels.ravel(), minlength=count + 1)
-    rim = fixture & ~ndimage.binary_erosion(fixture, iterations=2)
-    sizes[np.unique(labels[rim])] = 0
-    sizes[0] = 0
-    return bool(sizes.max() * resolution**2 >= _AreaLimits.of(resolution).recess)
-
-
-def _find_fixture(
-    height: NDArray[np.float32], relief: NDArray[np.float32], high: Mask, resolution: float
-) -> _Fixture | None:
-    """Finds the largest plateau among the high pixels. Returns its convex hull and the plane of its
-    top, or None."""
-    least = _AreaLimits.of(resolution).fixture
-    if high.sum() * resolution**2 < least:
-        return None
-    level = _mode(relief[high])
-    plateau = ndimage.binary_opening(high & (np.abs(relief - level) < _PLANE_BAND), _NEIGHBOURS)
-    # Close gaps, so that a recess from rim to rim does not cut the plateau in two.
-    closed = ndimage.binary_closing(plateau, _NEIGHBOURS, max(1, round(_CLOSING / resolution)))
-    labels, count = ndimage.label(closed, _NEIGHBOURS)
-    if not count:
-        return None
-    sizes = np.bincount(labels[plateau], minlength=count + 1)
-    sizes[0] = 0
-    plateau &= labels == sizes.argmax()
-    if plateau.sum() * resolution**2 < least:
-        return None
-    plateau = _along_tilt(plateau, height, high, resolution)
-    try:
-        hull = ConvexHull(np.argwhere(plateau))
-    except QhullError:
-        return None
-    rows, cols = np.indices(height.shape)
-    fixture = np.ones(height.shape, bool)
-    for a, b, offset in hull.equations:
-        fixture &= a * rows + b * cols + offset <= 0.5
-    start = float(np.median(height[plateau]))
-    return fixture, _fit_plane(height, start, plateau)
-
-
-def _along_tilt(plateau: Mask, height: NDArray[np.float32], high: Mask, resolution: float) -> Mask:
-    """Extends a level band of a tilted plateau to the whole plateau. Returns a level plateau
-    unchanged."""
-    for _ in range(_TILT_ROUNDS):
-        plane = _fit_plane(height, float(np.median(height[plateau])), plateau)
-        if math.hypot(plane[0], plane[1]) < _LEVEL * resolution:
-            return plateau
-        near = high & (np.abs(height - _plane_heights(plane, height.shape)) < _PLANE_BAND)
-        near = ndimage.binary_opening(near, _NEIGHBOURS)
-        labels, count = ndimage.label(
-            ndimage.binary_closing(near, _NEIGHBOURS, max(1, round(_CLOSING / resolution))),
-            _NEIGHBOURS,
-        )
-        sizes = np.bincount(labels[near & plateau], minlength=count + 1)
-        sizes[0] = 0
-        if not sizes.any():
-            return plateau
-        plateau = near & (labels == sizes.argmax())
-    return plateau
 
 
 def _regions(
@@ -480,7 +302,7 @@ def _regions(
         core: the part of the mask in which area and height are measured; None for all of it.
     """
     core = mask if core is None else core
-    labels, count = ndimage.label(mask, _NEIGHBOURS)
+    labels, count = ndimage.label(mask, NEIGHBOURS)
     sizes = np.bincount(labels[core], minlength=count + 1)
     sizes[0] = 0
     result = []

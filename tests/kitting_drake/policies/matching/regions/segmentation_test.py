@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from kitting_drake.policies.matching.segmentation import segment
+from kitting_drake.policies.matching.regions.segmentation import segment
 from systems.signals import Observation, PixelGrid
 
 GRID = PixelGrid()
