@@ -6,6 +6,7 @@ import numpy as np
 import trimesh
 from manifold3d import Manifold, Mesh
 from numpy.typing import NDArray
+from scipy.spatial import QhullError
 
 from kitting_drake.hkd.tools.collision import thinned
 from kitting_drake.hkd.tools.tool import Tool
@@ -41,9 +42,12 @@ def convex_body(tool: Tool) -> ConvexBody:
         for part in slab.decompose():
             hull = part.hull()
             if hull.volume() > _LEAST_VOLUME:
-                hulls.append(_thinned(np.asarray(hull.to_mesh().vert_properties, float)[:, :3]))
+                points = _thinned(np.asarray(hull.to_mesh().vert_properties, float)[:, :3])
+                hulls += [] if points is None else [points]
     if not hulls:
-        hulls = [_thinned(np.asarray(mesh.vertices, float))]
+        points = np.asarray(mesh.vertices, float)
+        thin = _thinned(points)
+        hulls = [points if thin is None else thin]
     parts = [trimesh.Trimesh(points).convex_hull for points in hulls]
     whole = trimesh.util.concatenate(parts)
     whole.density = (tool.mass or _MASS) / sum(part.volume for part in parts)
@@ -55,7 +59,13 @@ def convex_body(tool: Tool) -> ConvexBody:
     )
 
 
-def _thinned(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(m, 3) the corners of a convex hull, simplified so that it has no thin slivers, which break
-    contact computations."""
-    return thinned(1e3 * points, _THINNED_MM) / 1e3
+def _thinned(points: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """Simplifies a convex hull so that it has no thin slivers, which break contact computations.
+
+    Returns:
+        (m, 3) the corners of the simplified hull; None if all of the hull is such a sliver.
+    """
+    try:
+        return thinned(1e3 * points, _THINNED_MM) / 1e3
+    except QhullError:
+        return None

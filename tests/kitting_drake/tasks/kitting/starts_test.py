@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import trimesh
 from pydrake.math import RigidTransform
 
 from kitting_drake.common.errors import UserError
@@ -76,6 +77,15 @@ def test_a_part_shorter_than_the_overhang_leans_too():
     kit, part = SimpleNamespace(size=(0.2, 0.2, 0.04)), SimpleNamespace(length=0.009)
     poses = [_lean(kit, part, side, np.random.default_rng(side)) for side in range(4)]
     assert all(tilt(X_KT) > 0.5 for X_KT in poses)
+
+
+def test_a_sliver_of_a_tool_is_left_out():
+    block = trimesh.creation.box((0.02, 0.02, 0.01))
+    sliver = trimesh.creation.box((0.02, 0.01, 0.00002)).apply_translation((0.0, 0.0, 0.02))
+    triangles = np.concatenate([block.triangles, sliver.triangles])
+    body = convex_body(SimpleNamespace(triangles=triangles, mass=0.1))
+    assert len(body.pieces) == 1
+    np.testing.assert_allclose(np.ptp(body.pieces[0], axis=0), (0.02, 0.02, 0.01), atol=1e-6)
 
 
 def test_a_tool_settles_as_convex_pieces():
