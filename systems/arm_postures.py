@@ -46,8 +46,9 @@ class HandStop:
     y: float
     yaw: float
     low: float
-    """Lowest height of the fingertips, in m; `high` is the highest."""
+    """Lowest height of the fingertips, in m."""
     high: float
+    """Highest height of the fingertips, in m."""
     surface: float
     """Height of the highest surface around the hand, in m."""
 
@@ -116,8 +117,8 @@ class ArmPostures:
     def choose(
         self, stops: Sequence[HandStop], now: NDArray[np.float64]
     ) -> tuple[list[NDArray[np.float64]], str]:
-        """Chooses a posture at the high end of each stop, so that the whole motion is short and the
-        hand tilts as little as possible between two stops.
+        """Chooses a posture at the height `high` of each stop, so that the whole motion is short
+        and the hand tilts as little as possible between two stops.
 
         The jaws are symmetric, so the yaws may be turned by pi, but only at all stops together.
 
@@ -218,7 +219,7 @@ class ArmPostures:
         self, stop: HandStop, swivels: NDArray[np.float64]
     ) -> list[tuple[int, NDArray[np.float64]]]:
         """All possible postures at a stop, each as (number of half turns of the jaws, joint
-        positions at the high end)."""
+        positions at the height `high`)."""
         found = [
             (half_turn, way)
             for half_turn in (0, 1)
@@ -231,8 +232,11 @@ class ArmPostures:
         return [(turned, way[-1]) for turned, way in found]
 
     def _is_continuous(self, way: NDArray[np.float64]) -> bool:
-        """Whether the arm can move its hand on a straight line from the high to the low end of a
-        stop."""
+        """Whether the arm can move its hand straight down from the height `high` to `low`.
+
+        Args:
+            way: an array from `_ways`.
+        """
         if not way[:, [2, 4]].any():
             return True
         if np.abs(way[-1] - way[0]).max() > _JUMP:
@@ -248,8 +252,8 @@ class ArmPostures:
     def _ways(
         self, stop: HandStop, yaw: float, swivels: NDArray[np.float64]
     ) -> list[NDArray[np.float64]]:
-        """Returns an array for each posture: (k, 7) joint positions at k heights from the low to
-        the high end. Heights out of reach are NaN."""
+        """Returns an array for each posture: (k, 7) joint positions at k heights from `low` up to
+        `high`. Rows for heights out of reach are NaN."""
         heights = np.linspace(stop.low, stop.high, 5)
         poses = np.array([[stop.x, stop.y, z, yaw] for z in heights])
         x, y, z, yaws = np.moveaxis(self.base.to_base(poses), -1, 0)

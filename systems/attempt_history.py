@@ -32,8 +32,8 @@ class _Row(VectorView):
     """Index of the outcome in `OUTCOMES`."""
     peak_force = Number()
     balance = Array(2)
-    """Measured centre of mass of the object, x and y in the world in m; NaN if it was not
-    measured."""
+    """Measured centre of mass of the object, x and y in the world in m; NaN unless the attempt set
+    the object down again."""
 
 
 class AttemptHistory:
@@ -92,8 +92,11 @@ class AttemptHistory:
         return tuple(failed[-MOST_FAILED:])
 
     def set_downs(self, pick: PlanarPose) -> int:
-        """How many attempts measured an object's centre of mass near a pick. Each of them set the
-        object down again."""
+        """How many attempts set the object at a pick down again.
+
+        Such an attempt measures the object's centre of mass first. It is counted if this centre is
+        within `_SAME_OBJECT` of the pick.
+        """
         felt = self._rows[: self._count(), -2:]
         away = np.linalg.norm(felt - (pick.x, pick.y), axis=1)
         return int(np.count_nonzero(away < _SAME_OBJECT))

@@ -61,9 +61,10 @@ class PickPlacePolicy(LeafSystem):
     def __init__(self, *, policy: PolicyFunction, heights_only: bool = False) -> None:
         """
         Args:
-            policy: evaluating the port raises a `PolicyError` if the policy raises, a `TypeError`
-                if it does not return a `PickPlaceAction` of numbers, and a `ValueError` if its
-                poses are not finite.
+            policy: the function that computes the action. If it raises, evaluating the port
+                `action` raises a `PolicyError`. If it does not return a `PickPlaceAction` of
+                numbers, a `TypeError` is raised. If one of its poses is not finite, or its reason
+                is unknown, a `ValueError` is raised.
             heights_only: whether the policy uses only the heights of o_t, not its colours.
         """
         super().__init__()

@@ -90,10 +90,11 @@ class PlannerState(VectorView):
     aside = Number()
     """1 if the action lays the object aside, else 0."""
     lever = Number()
-    """Position of the object's centre of mass relative to the pads' middle, along the pads, in m,
-    if the object is set down again."""
+    """Position of the object's centre of mass relative to the pads' middle, along the pads, in m.
+    It is recorded in the history if the object is set down again."""
     trial_weight = Number()
-    """The largest weight felt in the trial lift, in N. The table then bears least of the object."""
+    """The largest weight felt in the trial lift, in N: that at the moment when the table bears the
+    least part of the object's weight."""
     doubts_grip = Number()
     """1 during a trial lift of an object that may turn between the pads, else 0."""
     trusts_grip = Number()

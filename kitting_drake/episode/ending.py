@@ -52,8 +52,11 @@ class Remainder:
 
 
 def find_left_over(station: KittingStation, root_context: Context) -> Remainder:
-    """Finds the objects and goals left over: those that the policy reported, or else those of the
-    true state."""
+    """Finds the objects and goals that are left over.
+
+    If the policy reported them when it stopped, its report is returned. Otherwise they are computed
+    from the true state.
+    """
     action = station.accepted_action(root_context)
     if action.stop and action.left_over is not None:
         seen = action.left_over

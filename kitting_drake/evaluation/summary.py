@@ -19,8 +19,9 @@ Entry = dict[str, Any]
 """An object or an action in the result of an episode."""
 
 FAILED = "failed episode"
+"""The cause of all objects of an episode that an error ended."""
 TIMED_OUT = "timed out"
-"""The cause of all objects of an episode that timed out."""
+"""The cause of all objects of an episode that the time limit ended."""
 
 UNKNOWN = "unknown"
 """The category of the single object as which a failed episode counts if no other episode has

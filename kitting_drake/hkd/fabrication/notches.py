@@ -24,9 +24,9 @@ _SLIDES = tuple(sign * step for step in np.arange(0.0, 0.041, 0.004) for sign in
 _SHARES = (0.85, 1.15)
 """The least and largest area of a notch outside its cavity, as shares of a half disc's area."""
 _FINS = 1.6
-"""The largest area of thin fins that the test in `_notch` may find beside a notch.
+"""The largest area that the test for thin fins in `_notch` may find.
 
-It is given as a multiple of the area that the test finds at two right-angled corners.
+It is given as a multiple of the area that the test finds at two right-angled corners without fins.
 """
 _OVERLAP = 0.001
 """The overlap of a notch with its cavity, in metres, so that no thin skin is left between them."""
@@ -158,8 +158,9 @@ def _notch(cavity: Cavity, disc: CrossSection, radius: float, wall: float) -> Cr
     share = beside.area() / (math.pi * radius**2 / 2)
     if len(beside.decompose()) != 1 or not _SHARES[0] <= share <= _SHARES[1]:
         return None
-    # A morphological closing fills thin gaps. It fills little area at two right-angled corners, and
-    # more beside thin fins.
+    # Look for thin fins of the block between the notch and the cavity. A morphological closing of
+    # the empty area covers them. It also covers a little at the two corners where the notch meets
+    # the cavity, so compare its area with that at two right-angled corners.
     x_min, y_min, x_max, y_max = disc.bounds()
     near = CrossSection.square((x_max - x_min + 4 * wall, y_max - y_min + 4 * wall)).translate(
         (x_min - 2 * wall, y_min - 2 * wall)

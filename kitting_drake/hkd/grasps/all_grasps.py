@@ -61,9 +61,10 @@ def all_grasps(tool: Tool) -> tuple[Grasp, ...]:
 def carrying_grasps(tool: Tool) -> tuple[Grasp, ...]:
     """Returns the grasps by which to carry a tool, best first.
 
-    These are the tool's own grasps if the tool's weight does not turn it between the pads in the
-    first of them. Otherwise, these are the grasps of `all_grasps`, ordered by the moment of the
-    weight that exceeds what the pads hold.
+    A heavy tool that is gripped far from its centre of mass turns between the pads. If the tool's
+    annotated grasp avoids this, the tool's own grasps are returned. Otherwise the grasps of
+    `all_grasps` are returned, ordered by how much the moment of the tool's weight about the pads
+    exceeds `_EASY_MOMENT`.
 
     Raises:
         UserError: as for `all_grasps`.

@@ -47,7 +47,13 @@ class _Surface:
         return self.add_vertices(np.column_stack([flat, np.full(len(flat), z)]))
 
     def add_walls(self, loops: list[NDArray[np.float64]], lower: int, upper: int) -> None:
-        """Joins two rings of the same loops by vertical walls."""
+        """Adds vertical walls between two rings that `add_ring` made of the same loops.
+
+        Args:
+            loops: the loops.
+            lower: the index of the lower ring's first vertex.
+            upper: the index of the upper ring's first vertex.
+        """
         start = 0
         for loop in loops:
             here = start + np.arange(len(loop))
@@ -63,7 +69,15 @@ class _Surface:
         inner_loops: list[NDArray[np.float64]],
         inner: int,
     ) -> None:
-        """Joins a ring to a narrower, lower one by triangulating the band between their loops."""
+        """Adds a bevel between a ring and a narrower, lower one: triangulates the band between
+        their loops.
+
+        Args:
+            outer_loops: the loops of the wider, upper ring.
+            outer: the index of its first vertex.
+            inner_loops: the loops of the narrower, lower ring.
+            inner: the index of its first vertex.
+        """
         band = np.asarray(triangulate(outer_loops + [loop[::-1] for loop in inner_loops]))
         starts = np.cumsum([0, *map(len, inner_loops[:-1])])
         inner_index = [

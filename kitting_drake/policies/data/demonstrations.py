@@ -333,7 +333,7 @@ def _checked(group: h5py.Group, name: str, shape: tuple[int, ...], digest: Any) 
     dataset = group[name]
     values = dataset[()]
     if values.shape != shape:
-        raise ValueError(f"{group.name}/{name} has the wrong shape, {values.shape}")
+        raise ValueError(f"{group.name}/{name} must have the shape {shape}, not {values.shape}")
     if not np.isfinite(values).all():
         raise ValueError(f"{group.name}/{name} has entries that are not finite")
     digest.update(np.ascontiguousarray(values).data)

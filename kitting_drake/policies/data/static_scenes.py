@@ -181,7 +181,11 @@ def read_static_scenes(path: Path) -> StaticScenes:
 def _check(heights: NDArray, actions: NDArray, first: NDArray, grid: PixelGrid) -> None:
     """Raises ValueError if the contents are inconsistent."""
     if heights.shape[1:] != grid.shape or heights.dtype != np.uint16:
-        raise ValueError(f"its heights have the wrong shape {heights.shape} or type")
+        rows, cols = grid.shape
+        raise ValueError(
+            f"its heights must be uint16 with the shape (scenes, {rows}, {cols}), but are "
+            f"{heights.dtype} with the shape {heights.shape}"
+        )
     if actions.ndim != 2 or actions.shape[1] != 8 or not np.isfinite(actions).all():
         raise ValueError(
             f"its actions must be rows of 8 finite numbers, but have the shape {actions.shape}"

@@ -19,8 +19,8 @@ from kitting_drake.policies.networks.factored import Networks
 BETAS = (0.9, 0.999)
 
 _STOP_PROBABILITY = 1 / 8
-"""The probability that networks with a stop class also learn from a final observation with a
-sample."""
+"""The probability that a sample of networks with a stop class is accompanied by a final
+observation."""
 
 
 @dataclass(frozen=True)
@@ -192,7 +192,7 @@ class Trainer:
     def _draw(
         self, number: int, samples: Sequence[LabelledImage], finals: Sequence[Pictured]
     ) -> _Draw:
-        """Draws and augments a sample, and sometimes a final observation.
+        """Draws and augments a sample, and with one of eight samples also a final observation.
 
         Args:
             number: the number of the sample in the whole training.

@@ -66,7 +66,7 @@ class Convolutions:
         """Returns the total time of all calls, in seconds.
 
         Args:
-            timings: the timing of each function of `alone`.
+            timings: the timing of each function that `alone` returns, by the same keys.
         """
         return sum(count * timings[call].seconds for call, count in self.calls.items())
 

@@ -71,7 +71,8 @@ def paper_sections(
 
 
 def has_figure(task: str, results: Sequence[Result]) -> bool:
-    """Whether there are cells of both methods of a task's figure 6, so that it can be drawn."""
+    """Whether there are results of both methods that figure 6 compares on a task, so that it can be
+    drawn."""
     methods = {
         result.cell.policy.method
         for result in results
@@ -81,7 +82,7 @@ def has_figure(task: str, results: Sequence[Result]) -> bool:
 
 
 def has_table_1(results: Iterable[Result]) -> bool:
-    """Whether there is a cell of the Ravens tasks."""
+    """Whether there is a result for table I, which is on the Ravens tasks."""
     return any(TASKS[result.cell.task].table == "I" for result in results)
 
 

@@ -16,8 +16,10 @@ _TEXT, _MERGE = "tag:yaml.org,2002:str", "tag:yaml.org,2002:merge"
 
 
 class _Dumper(yaml.SafeDumper):
-    """Writes mappings as Drake's `yaml_load` returns them, with a mapping's tag under its key
-    `_tag`."""
+    """Writes mappings that Drake's `yaml_load` returned.
+
+    `yaml_load` keeps the tag of a mapping under the key `_tag`; here it becomes a tag again.
+    """
 
     def ignore_aliases(self, data: Any) -> bool:
         """Returns True, so that a repeated mapping is written again instead of as a reference."""
@@ -33,10 +35,10 @@ _Dumper.add_representer(dict, _represent_tagged)
 
 
 def dumped(raw: dict) -> str:
-    """Converts a mapping to YAML and keeps its order, which matters for paints: the last match
-    wins.
+    """Converts a mapping to YAML and keeps its order.
 
-    Drake's `yaml_dump` would sort it.
+    The order matters for `appearance.paints`, where the last matching pattern wins. Drake's
+    `yaml_dump` would sort the names.
     """
     return yaml.dump(raw, Dumper=_Dumper, sort_keys=False)
 

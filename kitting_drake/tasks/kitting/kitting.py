@@ -255,10 +255,15 @@ class _DrawnKitting(KittingTask):
         for name in ("riser", "tilt_deg", "tool_mass"):
             least, greatest = getattr(self, name)
             if least > greatest:
-                raise ValueError(f"task.{name} must be [least, greatest]")
+                raise ValueError(
+                    f"task.{name} must be [least, greatest], not [{least:g}, {greatest:g}]"
+                )
         least, greatest = self.tool_mass
         if (least == 0) != (greatest == 0):
-            raise ValueError("task.tool_mass must be [least, greatest], both positive, or [0, 0]")
+            raise ValueError(
+                "task.tool_mass must be [least, greatest], both positive, or [0, 0], not "
+                f"[{least:g}, {greatest:g}]"
+            )
         check_start(self.start, self.tray, self.faces, self.distractors)
         if (self.start != APART or self.tray) and (
             self.kits > 1 or any(self.riser + self.tilt_deg)
@@ -386,8 +391,11 @@ class ToolsetKitting(_DrawnKitting):
         super().validate()
         if self.split not in SPLITS:
             raise ValueError(f"task.split must be one of {', '.join(SPLITS)}, not '{self.split}'")
-        if self.tool_length[0] > self.tool_length[1]:
-            raise ValueError("task.tool_length must be [least, greatest]")
+        least, greatest = self.tool_length
+        if least > greatest:
+            raise ValueError(
+                f"task.tool_length must be [least, greatest], not [{least:g}, {greatest:g}]"
+            )
         check_start(self.start, self.tray, self.faces, self.distractors)
 
 

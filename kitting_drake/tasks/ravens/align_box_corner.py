@@ -64,7 +64,9 @@ class AlignBoxCorner(PoseTask):
         for name in ("box_sides", "box_height"):
             least, greatest = getattr(self, name)
             if least > greatest:
-                raise ValueError(f"task.{name} must be [least, greatest]")
+                raise ValueError(
+                    f"task.{name} must be [least, greatest], not [{least:g}, {greatest:g}]"
+                )
 
 
 def corner_poses(size: tuple[float, float, float]) -> list[RigidTransform]:

@@ -205,7 +205,7 @@ class AssemblingKits(PoseTask):
         if self.split not in _SPLITS:
             raise ValueError(f"task.split must be one of {', '.join(_SPLITS)}, not '{self.split}'")
         if len(self.scale) != 3:
-            raise ValueError("task.scale must be [x, y, z]")
+            raise ValueError(f"task.scale must have three factors [x, y, z], not {len(self.scale)}")
 
 
 def _grown_rim(tool: Tool, parameters: KitParameters) -> CrossSection:
