@@ -201,8 +201,11 @@ LAZY = {
     "kitting_drake.evaluate": {"torch", "escnn"},
     "kitting_drake.decide": {"pydrake", "torch", "escnn"},
     "kitting_drake.demonstrate": {"pydrake", "torch", "escnn"},
+    "kitting_drake.train": {"pydrake"},
     "kitting_drake.gym": {"pydrake", "torch", "escnn"},
     "kitting_drake.gym.environment": {"torch", "escnn"},
+    "kitting_drake.policies.learned_policy": {"pydrake", "escnn"},
+    "kitting_drake.policies.networks.weights": {"pydrake", "escnn"},
     "kitting_drake.policies.matching.shape_matching": {"pydrake", "torch", "escnn"},
 }
 """Packages that load slowly, or may be missing, and that these modules import when needed."""

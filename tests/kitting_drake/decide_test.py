@@ -43,6 +43,8 @@ from tests.kitting_drake.real_camera.frames import (
     write_frames,
 )
 
+Verb = Callable[..., subprocess.CompletedProcess[str]]
+
 TRUE = calibration_of(Scenario())
 BLOCK = Block((0.20, 0.15, 0.05), (0.45, -0.2, 1.1))
 
@@ -77,7 +79,7 @@ def scene(rendering: None) -> Rendered:
     return rendered(1501, "!ShapeMatching {}")
 
 
-@pytest.mark.parametrize("high", [0.008, 0.04])
+@pytest.mark.parametrize("high", [0.008, pytest.param(0.04, marks=pytest.mark.slow)])
 def test_recovers_when_the_cell_does(high: float, scene: Rendered):
     """A slightly protruding tool is pressed; one that protrudes more is taken out at the end."""
     seen = scene.observation
@@ -189,8 +191,13 @@ def refusal(bench: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., str]:
 
 
 def command(bench: Path, *flags: object) -> subprocess.CompletedProcess[str]:
-    """Runs `decide` in a process without Drake."""
-    arguments = [bench, "--camera", bench / "calibration.yaml", "--output", bench / "out", *flags]
+    """Decides on the frames of a folder in a process without Drake."""
+    arguments = [bench, "--camera", bench / "calibration.yaml", "--output", bench / "out"]
+    return run_without_drake(*arguments, *flags)
+
+
+def run_without_drake(*arguments: object) -> subprocess.CompletedProcess[str]:
+    """Runs `decide` in a process without Drake, which says whether it loaded torch."""
     return subprocess.run(
         [sys.executable, "-c", _NO_DRAKE, *map(str, arguments)],
         cwd=ROOT,
@@ -200,9 +207,10 @@ def command(bench: Path, *flags: object) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_shape_matching_needs_neither_drake_nor_torch(bench: Path):
-    done = command(bench, "--shape_matching")
-    assert (done.returncode, done.stderr.strip()) == (0, "False"), done.stderr
+def test_the_command_stops_where_nothing_fits(bench: Path, verb: Verb):
+    arguments = [bench, "--camera", bench / "calibration.yaml", "--output", bench / "out"]
+    done = verb("decide", *arguments, "--shape_matching")
+    assert done.returncode == 0, done.stderr
     record = json.loads((bench / "out" / "action.json").read_text())
     assert record["stop"] is True
     assert "pick" not in record
@@ -212,24 +220,15 @@ def test_shape_matching_needs_neither_drake_nor_torch(bench: Path):
 SAMPLE = ROOT / "models" / "sample_frame"
 
 
-def decide_sample(folder: Path, robot: str) -> dict[str, Any]:
-    """Decides the sample frame for a robot, in a process without Drake; returns the action."""
-    (folder / "robot.yaml").write_text(robot)
-    arguments = [SAMPLE, "--camera", SAMPLE / "calibration.yaml", "--output", folder / "out"]
-    flags = ["--shape_matching", "--robot", folder / "robot.yaml", "--rate", 500]
-    done = subprocess.run(
-        [sys.executable, "-c", _NO_DRAKE, *map(str, arguments + flags)],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
+def test_writes_the_trajectory_of_a_robot_or_says_what_is_out_of_reach(tmp_path: Path, verb: Verb):
+    """The first decision is that of a process that loads neither Drake nor torch."""
+    robot, out = tmp_path / "robot.yaml", tmp_path / "out"
+    arguments = [SAMPLE, "--camera", SAMPLE / "calibration.yaml", "--output", out]
+    arguments += ["--shape_matching", "--robot", robot, "--rate", 500]
+    robot.write_text("{model: fr3, base: [0, 0, 0]}")
+    done = run_without_drake(*arguments)
     assert (done.returncode, done.stderr.strip()) == (0, "False"), done.stderr
-    return json.loads((folder / "out" / "action.json").read_text())
-
-
-def test_writes_the_trajectory_of_a_robot_or_says_what_is_out_of_reach(tmp_path: Path):
-    record = decide_sample(tmp_path, "{model: fr3, base: [0, 0, 0]}")
+    record = json.loads((out / "action.json").read_text())
     assert record["result"] == "pick and place"
     content = json.loads((tmp_path / "out" / record["trajectory"]).read_text())
     message = content["joint_trajectory"]
@@ -244,7 +243,9 @@ def test_writes_the_trajectory_of_a_robot_or_says_what_is_out_of_reach(tmp_path:
     assert len(rows) == 1 + len(message["points"])
     assert rows[0].startswith("time_from_start,position_fr3_joint1,")
     # Far from the table nothing is written that could move an arm.
-    record = decide_sample(tmp_path, "{base: [-0.3, 0.9, 0], home: [-0.3, 0.5, 0.4, 0]}")
+    robot.write_text("{base: [-0.3, 0.9, 0], home: [-0.3, 0.5, 0.4, 0]}")
+    assert verb("decide", *arguments).returncode == 0
+    record = json.loads((out / "action.json").read_text())
     assert (record["result"], record["stop"]) == ("not sure", True)
     assert re.match(r"the pick at \(0.480, 0.221\) m is out of the arm's reach", record["reason"])
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"action.json", "decision.png"}
@@ -287,9 +288,7 @@ def test_an_invalid_block_is_refused(pose: tuple, message: str, refusal: Callabl
     assert re.match(message, refusal(*flags))
 
 
-def test_invalid_input_prints_one_line(
-    bench: Path, verb: Callable[..., subprocess.CompletedProcess[str]]
-):
+def test_invalid_input_prints_one_line(bench: Path, verb: Verb):
     arguments = [bench, "--camera", bench / "calibration.yaml", "--output", bench / "out"]
     (bench / "left_depth.npy").unlink()
     (bench / "out").mkdir()
@@ -533,10 +532,12 @@ def test_frames_may_be_pairs_of_files(bench: Path):
 
 def test_without_outlines_the_networks_certainty_counts(scene: Rendered):
     """The fitted confidence is of decisions by outlines. Nothing is refused without being asked."""
-    found = load_policy(fit_outlines=False).choose(scene.observation)
+    found = load_policy(fit_outlines=False, orientations=36).choose(scene.observation)
     assert not found.action.stop
     assert found.confidence == pytest.approx(np.prod(list(found.parts.values())))
-    strict = load_policy(fit_outlines=False, least_confidence=0.999).choose(scene.observation)
+    strict = load_policy(fit_outlines=False, orientations=36, least_confidence=0.999).choose(
+        scene.observation
+    )
     assert strict.action.stop and strict.action.reason == "not sure"
 
 

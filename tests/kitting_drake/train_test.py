@@ -78,7 +78,9 @@ def demos(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def words(demos: Path, folder: Path, *more: object) -> list[str]:
     """The arguments of `python -m kitting_drake.train`."""
-    flags = ("--preset", "tiny", "--steps", 4, "--validate-every", 3, "--learning-rate", "0.01")
+    # Few orientations are faster.
+    flags = ("--preset", "tiny", "--orientations", 36, "--steps", 4)
+    flags += ("--validate-every", 3, "--learning-rate", "0.01")
     return [str(word) for word in ("--demos", demos, "--output", folder, *flags, *more)]
 
 
@@ -160,9 +162,9 @@ def test_from_starts_with_given_weights(
     assert list(card["start_learned"].values()) == [[10, 11, 12]]
     fewer = refused(demos, tmp_path / "no", "--from", start, "--demonstrations", 2)
     assert "was trained on seed 12, which is in the validation data" in fewer
-    assert "give --orientations 180" in refused(
-        demos, tmp_path / "no", "--from", start, "--orientations", 36
-    )
+    for flag, other, own in (("--orientations", 48, 36), ("--preset", "small", "tiny")):
+        told = refused(demos, tmp_path / "no", "--from", start, flag, other)
+        assert f"give {flag} {own}" in told
     finer = dataclasses.replace(ORIGIN, grid=dataclasses.replace(GRID, resolution=0.002))
     told = refused(
         write(tmp_path / "finer.h5", range(20, 24), finer), tmp_path / "no", "--from", start
@@ -196,6 +198,7 @@ def test_angle_only_with_another_n(demos: Path, tmp_path: Path, method: str):
     assert set(log(path.parent)[-1]) == {"step", "pick_angle"}
 
 
+@pytest.mark.slow
 def test_angle_only_with_another_preset(demos: Path, tmp_path: Path, refused: Callable[..., str]):
     both = ("--method", "equivariant_transporter", "--orientations", 6)
     train(demos, tmp_path / "first", *both, "--preset", "small", "--steps", 1)
@@ -440,11 +443,10 @@ run_command(main)
 """
 
 
-@pytest.mark.parametrize("method", ["transporter", pytest.param("so2", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["transporter", "so2"])
 def test_trains_where_drake_is_not_installed(demos: Path, tmp_path: Path, method: str):
     flags = words(demos, tmp_path, "--method", method, "--steps", 1, "--quiet")
-    # Few rotations are faster.
-    flags += ["--orientations", "36"]
     command = [sys.executable, "-c", NO_DRAKE, *flags]
     done = subprocess.run(command, cwd=ROOT, env=ONE_THREAD, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -600,10 +600,10 @@ def test_a_missed_grasp_is_counted_and_retried():
 def test_the_latest_failed_picks_are_remembered():
     """In their order, and no more than there is room for."""
     world = World(width=lambda attempt, mode: 0.0)
-    run = Run(world, actions=20, parameters=dataclasses.replace(PARAMETERS, max_actions=20))
-    picks = [dataclasses.replace(PICK, x=0.3 + 0.01 * number) for number in range(20)]
+    run = Run(world, actions=18, parameters=dataclasses.replace(PARAMETERS, max_actions=18))
+    picks = [dataclasses.replace(PICK, x=0.3 + 0.01 * number) for number in range(18)]
     run.policy.answers = [dataclasses.replace(ACTION, pick=pick) for pick in picks]
-    assert run.finish().counts == [20, 20, 0]
+    assert run.finish().counts == [18, 18, 0]
     assert run.output("failed_picks") == tuple(picks[-16:])
 
 

@@ -30,7 +30,7 @@ def decision(
     )
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def observation() -> Observation:
     return Observation(np.random.default_rng(1).random((4, *GRID.shape), np.float32), GRID)
 
@@ -41,8 +41,12 @@ def drawn(observation: Observation, decision: Decision) -> np.ndarray:
         return np.asarray(picture.convert("RGB"))
 
 
-def test_draw_decision_shows_the_decision(observation: Observation):
-    picture = drawn(observation, decision(observation))
+@pytest.fixture(scope="module")
+def picture(observation: Observation) -> np.ndarray:
+    return drawn(observation, decision(observation))
+
+
+def test_draw_decision_shows_the_decision(observation: Observation, picture: np.ndarray):
     assert picture.shape == (880, 1320, 3)
     np.testing.assert_array_equal(picture, drawn(observation, decision(observation)))
     for other in (
@@ -53,13 +57,14 @@ def test_draw_decision_shows_the_decision(observation: Observation):
         assert (drawn(observation, other) != picture).any()
 
 
-def test_no_gripper_is_drawn_if_the_policy_stops(observation: Observation):
+def test_no_gripper_is_drawn_if_the_policy_stops(observation: Observation, picture: np.ndarray):
     pick_colour, place_colour = (228, 87, 46), (27, 153, 139)
-    acts = decision(observation)
-    stops = dataclasses.replace(acts, action=PickPlaceAction(stop=True), log_odds=-4.0)
-    pictures = [drawn(observation, item) for item in (acts, stops)]
+    stops = dataclasses.replace(
+        decision(observation), action=PickPlaceAction(stop=True), log_odds=-4.0
+    )
+    pictures = [picture, drawn(observation, stops)]
     for colour, shown_in_curve in ((pick_colour, True), (place_colour, False)):
-        counts = [int((picture == colour).all(axis=2).sum()) for picture in pictures]
+        counts = [int((item == colour).all(axis=2).sum()) for item in pictures]
         assert counts[0] > counts[1]
         assert (counts[1] > 0) == shown_in_curve
 

@@ -353,7 +353,7 @@ def test_colours_are_rendered_only_for_a_policy_that_sees_them(policy: PolicyCon
 def test_a_decision_observer_gets_colours():
     told: list[Observation] = []
     rig = build_rig(
-        Scenario(policy=Learned(), cameras=SMALL),
+        Scenario(policy=Learned(orientations=36), cameras=SMALL),
         seed=0,
         base=BASE,
         observer=lambda observation, _: told.append(observation),

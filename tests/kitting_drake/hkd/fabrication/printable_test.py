@@ -61,7 +61,7 @@ def check_kit(folder: Path) -> None:
         assert not ezdxf.readfile(path).audit().errors
 
 
-@pytest.mark.parametrize("gridfinity", [False, True])
+@pytest.mark.parametrize("gridfinity", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_slicers_and_cutters_find_nothing(gridfinity: bool, tmp_path: Path):
     made = export_kit(
         KitRequest(

@@ -32,7 +32,7 @@ def two_feet() -> trimesh.Trimesh:
         pytest.param(bar, 0.8, False, marks=pytest.mark.slow),
         (ring, 0.0, True),
         pytest.param(ring, 0.8, False, marks=pytest.mark.slow),
-        (two_feet, 0.0, False),
+        pytest.param(two_feet, 0.0, False, marks=pytest.mark.slow),
     ],
 )
 def test_an_open_underside_is_closed_flat(

@@ -158,7 +158,11 @@ def test_the_contact_surface_has_the_walls_of_the_block(tools: list[Tool], lead_
         # Kits whose cavities' bounding rectangles overlap.
         ["chipping_hammer", "tin_snips", "s_wrench", "precision_screwdriver"],
         ["rip_claw_hammer_fibreglass", "diagonal_cutters", "square_drive_screwdriver"],
-        ["claw_hammer", "t_handle_screwdriver", "tin_snips", "pipe_wrench", "soft_face_mallet"] * 2,
+        pytest.param(
+            ["claw_hammer", "t_handle_screwdriver", "tin_snips", "pipe_wrench", "soft_face_mallet"]
+            * 2,
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 @pytest.mark.parametrize("lead_in", [pytest.param(0.0, marks=pytest.mark.slow), 0.001])
@@ -367,6 +371,7 @@ def test_a_category_without_a_slot_is_nested(tools: list[Tool]):
     assert len(layout.poses) == 2
 
 
+@pytest.mark.slow
 def test_nested_kits_are_deterministic_and_watertight(cache: Path):
     tools = [load_tool(name) for name in SEVEN]
     kit = make_kit(tools, PARAMETERS)

@@ -144,7 +144,6 @@ def blind_networks() -> Networks:
     return networks
 
 
-@pytest.mark.parametrize("seen", [None], indirect=True)
 def test_an_object_that_fits_is_picked_even_if_the_networks_miss_it(seen):
     observation, _ = seen
     networks = blind_networks()
@@ -225,7 +224,7 @@ def test_a_grasp_without_room_moves_to_one_with_room(seen):
     def refined(pick, theta: float, failed=None):
         return refine_grasp(segmentation, pick, theta, grid.resolution, PLANNER, failed)
 
-    for index, (lies, _) in enumerate(true_places(scene)[:2]):
+    for index, (lies, _) in enumerate(true_places(scene)[:1]):
         grasp = scene.objects[index].grasps[0]
         pick = grid.to_pixel(rotation_matrix(lies[2]) @ (grasp.x, grasp.y) + lies[:2])
         theta = lies[2] + grasp.theta
@@ -270,7 +269,7 @@ def test_unseen_pixels_take_the_lowest_neighbouring_height():
     assert set(np.unique(filled)) == {np.float32(0.0), np.float32(0.05)}
 
 
-@pytest.fixture(scope="module", params=[7402, pytest.param(7417, marks=pytest.mark.slow)])
+@pytest.fixture(scope="module", params=[7402, 7417])
 def kitted(request) -> Observation:
     """A kit with all of its tools, and four boxes on the table."""
     scenario = load_scenario(
@@ -288,6 +287,7 @@ def kitted(request) -> Observation:
     return rig.port("observation", context)
 
 
+@pytest.mark.slow
 def test_boxes_do_not_match_the_visible_parts_of_filled_recesses(kitted: Observation):
     """These parts are narrow and match a box's side."""
     segmentation = segment(kitted)

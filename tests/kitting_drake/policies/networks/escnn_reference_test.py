@@ -71,6 +71,15 @@ def test_inference_gives_the_same(both: tuple[Networks, Networks]):
         expected = ours.alpha(image)
         assert_close(escnn.alpha.eval()(image), expected)
         escnn.alpha.train()
+
+
+@pytest.mark.slow
+def test_inference_with_half_the_bits_is_near(both: tuple[Networks, Networks]):
+    ours, _ = both
+    assert isinstance(ours, SO2Networks)
+    image = torch.randn(1, 4, 33, 33)
+    with torch.inference_mode():
+        expected = ours.alpha(image)
         half = as_escnn(ours, torch.bfloat16).eval().alpha(image)
     assert half.dtype == torch.float32
     difference = float((half - expected).std() / expected.std())

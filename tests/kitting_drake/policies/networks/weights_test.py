@@ -202,6 +202,7 @@ print(*action.pick.as_array(), *action.place.as_array())
 """
 
 
+@pytest.mark.slow
 def test_decides_without_escnn_or_drake(file: Path, tmp_path: Path):
     seen = observation(0)
     np.save(tmp_path / "image.npy", seen.image)

@@ -142,6 +142,7 @@ def test_the_learning_rate_follows_the_step():
     assert rates(resumed) == rates(learner) == {1e-4 * decayed(2, 300)}
 
 
+@pytest.mark.slow
 def test_every_loss_falls():
     learner = trainer(learning_rate=6e-3)
     losses = [learner.step([scene(0)]) for _ in range(9)]

@@ -225,7 +225,7 @@ def test_corrected_poses_are_the_true_ones():
         moved("left", shift=(0.002, -0.001, 0.003), rotvec_deg=(0.3, 0.1, -0.2)),
         {"right": moved("right", rotvec_deg=(-0.2, 0.2, 0)).cameras[2].X_BC},
     )
-    frames = noisy(frames_of_block(), noise=MILD, takes=5)
+    frames = noisy(frames_of_block(), noise=MILD, takes=3)
     corrected = check_cameras(frames, believed, BLOCK).corrected
     for camera, true in zip(corrected.cameras, TRUE.cameras, strict=True):
         away = np.linalg.inv(true.X_BC) @ camera.X_BC

@@ -114,10 +114,10 @@ def errors(found: NDArray, expected: NDArray) -> tuple[float, float]:
     ("text", "tilt", "model", "values"),
     [
         pytest.param(CHARUCO, 0, "", (), marks=pytest.mark.slow),
-        (CHARUCO, 15, "", BROWN),
+        pytest.param(CHARUCO, 15, "", BROWN, marks=pytest.mark.slow),
         pytest.param(CHARUCO, 30, "", (), marks=pytest.mark.slow),
         (CHARUCO, 45, "equidistant", FISHEYE),
-        (CHARUCO, 60, "", ()),
+        pytest.param(CHARUCO, 60, "", (), marks=pytest.mark.slow),
         pytest.param(APRILTAG, 5, "", (), marks=pytest.mark.slow),
         (APRILTAG, 40, "", BROWN),
     ],

@@ -446,6 +446,7 @@ def test_the_exit_code_reports_failures(
     assert ("it broke" in capsys.readouterr().out) == bool(code)
 
 
+@pytest.mark.slow
 def test_stopping_the_queue_stops_its_child_process(tmp_path: Path):
     """This uses the real commands, which lock their folders."""
     command = [sys.executable, "-m", "kitting_drake.benchmark", "paper"]
