@@ -21,6 +21,7 @@ from kitting_drake.policies.factory import load_learned_policy
 from kitting_drake.policies.matching.inventory import Inventory
 from kitting_drake.policies.matching.recovery import recovery_action
 from kitting_drake.policies.matching.regions.segmentation import segment
+from kitting_drake.policies.stages import Recovery
 from kitting_drake.real_camera import Frame, ShapeMatching, decide, load_policy, read_frames
 from kitting_drake.real_camera.calibrations.calibration import (
     Calibration,
@@ -79,7 +80,17 @@ def scene(rendering: None) -> Rendered:
     return rendered(1501, "!ShapeMatching {}")
 
 
-@pytest.mark.parametrize("high", [0.008, pytest.param(0.04, marks=pytest.mark.slow)])
+def test_recovers_by_the_stages_of_the_cell(weights_file: Path):
+    few: dict[str, Any] = {"orientations": 36, "recover": True}
+    here = load_policy(weights_file, **few).loaded.function
+    parameters = PickPlaceParameters()
+    there = load_learned_policy(weights_file, parameters, insertion=True, **few).function
+    assert here._stages == there._stages
+    assert any(isinstance(stage, Recovery) for stage in here._stages)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("high", [0.008, 0.04])
 def test_recovers_when_the_cell_does(high: float, scene: Rendered):
     """A slightly protruding tool is pressed; one that protrudes more is taken out at the end."""
     seen = scene.observation

@@ -62,10 +62,7 @@ OBJECT_KEYS = {
 }
 
 
-ONE_OF_EACH_KIND = {
-    *("kits:OneTool", "ravens:AlignBoxCorner"),
-    *("kitting_unseen:ShapeMatching", "raised_kits:Everything"),
-}
+ONE_OF_EACH_KIND = {"kits:OneTool", "ravens:AlignBoxCorner", "kitting_unseen:ShapeMatching"}
 """The tests of the other scenarios are slow; `schema_test` loads them all."""
 
 

@@ -85,6 +85,7 @@ def test_a_seated_tool_stays_in_its_cavity(kit: Kit):
     assert np.abs(data.qvel).max() < 0.02
 
 
+@pytest.mark.slow
 def test_the_dataset_has_mjcf_on_request(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(dataset, "toolsets", lambda split: toolsets(split)[:1])
     manifest = dataset.build_dataset(tmp_path / "hkd", lambda done, total: None, mjcf=True)

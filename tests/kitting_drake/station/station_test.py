@@ -279,6 +279,7 @@ def test_sleep_can_be_switched_off():
     assert rig.station.at_rest(root).all()  # The rest detector still reports it.
 
 
+@pytest.mark.slow
 def test_two_runs_of_a_seed_are_bit_identical():
     """Up to the middle of the first grasp, with objects that fell asleep."""
 
@@ -371,7 +372,14 @@ def test_a_policy_with_observations_needs_cameras_and_rendering(monkeypatch: pyt
         build(Scenario(policy=looks))
 
 
-@pytest.mark.parametrize("name", ["OneOfEverything", "OneOfEverythingElse", "OneOfEverythingDrawn"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "OneOfEverything",
+        "OneOfEverythingElse",
+        pytest.param("OneOfEverythingDrawn", marks=pytest.mark.slow),
+    ],
+)
 @pytest.mark.usefixtures("rendering")
 def test_one_of_everything_builds_and_steps(name: str):
     scenario = load_scenario(BASE.parent / "scenario" / "test_scenarios.yaml", name)

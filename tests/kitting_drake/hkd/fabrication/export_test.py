@@ -361,6 +361,7 @@ def test_the_command_suggests_a_tool_name(
     assert done.stderr.strip().splitlines()[-1].endswith("did you mean 'claw_hammer'?")
 
 
+@pytest.mark.slow
 def test_a_kit_for_an_arm_says_how_often_it_is_in_reach(
     verb: Callable[..., subprocess.CompletedProcess[str]],
     tmp_path: Path,
@@ -378,12 +379,17 @@ def test_a_kit_for_an_arm_says_how_often_it_is_in_reach(
     scenario = load_scenario(folder / "scenario.yaml")
     assert scenario.robot == FrankaArm(model="panda", base=[-0.25, 0.5, 0.0])
     assert scenario.planner.home == [0.3, 0.2, 0.4, 0.0]
-    # In the workspace no arm can stand; nothing is made.
+
+
+def test_no_kit_is_made_for_an_arm_in_the_workspace(
+    verb: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path
+):
+    robot = tmp_path / "robot.yaml"
     robot.write_text("{base: [0.5, 0, 0]}")
-    done = verb("hkd", "kit", "claw_hammer", "--output", tmp_path / "other", "--robot", robot)
+    done = verb("hkd", "kit", "claw_hammer", "--output", tmp_path / "kit", "--robot", robot)
     assert done.returncode == 2
     assert "the arm's foot stands in the workspace" in done.stderr
-    assert not (tmp_path / "other").exists()
+    assert not (tmp_path / "kit").exists()
 
 
 @pytest.mark.slow

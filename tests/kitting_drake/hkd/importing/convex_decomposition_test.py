@@ -54,6 +54,7 @@ def test_the_bottom_is_flat_at_zero():
     assert furthest(solid.project().hull(), bottom) < 0.4
 
 
+@pytest.mark.slow
 def test_the_deviation_of_a_complex_outline_is_reported(monkeypatch: pytest.MonkeyPatch):
     # Try the last tolerances only.
     last = convex_decomposition.OUTLINE_TOLERANCES_MM[-1:]

@@ -171,10 +171,14 @@ def test_an_outline_becomes_a_tool_of_its_size(tmp_path: Path):
     assert tool.footprint.area() == pytest.approx(1e-6 * (110 * 14 - 9 * np.pi), rel=1e-2)
 
 
-def test_an_outline_must_be_stable_as_drawn(tmp_path: Path):
+@pytest.mark.slow
+def test_an_outline_may_be_higher_than_wide(tmp_path: Path):
     path = drawing(tmp_path, '<rect width="150" height="10"/>')
     tool = load_tool(str(bring(path, height_mm=20.0).directory))
     assert (tool.length, tool.width, tool.height) == pytest.approx((0.150, 0.010, 0.020), abs=2e-5)
+
+
+def test_an_outline_must_be_stable_as_drawn(tmp_path: Path):
     path = drawing(tmp_path, '<rect width="150" height="4"/>')
     with pytest.raises(UserError, match="40 mm high"):
         bring(path, height_mm=40.0)

@@ -88,7 +88,10 @@ def assert_close(found: dict[str, Tensor], expected: dict[str, Tensor], relative
         torch.testing.assert_close(found[name], values, atol=atol, rtol=0, msg=lambda text: text)
 
 
-@pytest.mark.parametrize("config", [TINY, SMALL], ids=lambda config: config.preset)
+@pytest.mark.parametrize(
+    "config",
+    [pytest.param(TINY, id="tiny"), pytest.param(SMALL, id="small", marks=pytest.mark.slow)],
+)
 def test_loaded_networks_predict_the_same_as_trained_ones(config: NetworkConfig, tmp_path: Path):
     path = tmp_path / "policy.safetensors"
     save_weights(path, trained(config), CARD)

@@ -89,6 +89,7 @@ def test_impossible_exports_raise_user_errors(tmp_path: Path):
         export_onnx(tmp_path / "none.safetensors", tmp_path / "onnx")
 
 
+@pytest.mark.slow
 def test_the_command_exports_trained_networks(
     weights_file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):

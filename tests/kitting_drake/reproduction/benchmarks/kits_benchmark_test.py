@@ -3,7 +3,10 @@ import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
+import pytest
 
+
+@pytest.mark.slow
 def test_the_command(verb: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path):
     done = verb("benchmark", "kits", "--kits", 1, "--output", tmp_path)
     assert done.returncode == 0, done.stderr

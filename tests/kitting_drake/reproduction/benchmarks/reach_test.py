@@ -14,6 +14,7 @@ from systems.arm_kinematics import ArmBase
 from systems.signals import PixelGrid
 
 
+@pytest.mark.slow
 def test_maps_the_reach_and_finds_a_better_base():
     grid = PixelGrid(x_min=0.4, y_min=-0.15, rows=80, cols=96)
     given = BenchRobot("fr3", ArmBase(-0.3, 0.0, 0.0))
