@@ -166,6 +166,7 @@ class Run:
         parameters: PickPlaceParameters = PARAMETERS,
         insertion: bool = False,
         observation: Observation | None = None,
+        is_logged: bool = False,
     ) -> None:
         if answer is None:
             answer = ACTION if observation is None else PickPlaceAction(PICK, PLACE)
@@ -180,7 +181,11 @@ class Run:
         for port in ("hand_state", "hand_contact_force", "wrist_moment"):
             builder.Connect(hand.GetOutputPort(port), self.planner.GetInputPort(port))
         builder.Connect(self.policy.get_output_port(), self.planner.GetInputPort("action"))
-        self.log = LogVectorOutput(self.planner.GetOutputPort("desired_motion"), builder, 1 / 128)
+        # A log doubles the time of a run.
+        if is_logged:
+            self.log = LogVectorOutput(
+                self.planner.GetOutputPort("desired_motion"), builder, 1 / 128
+            )
         self.diagram = builder.Build()
         self.simulator = Simulator(self.diagram)
         if observation is not None:
@@ -339,7 +344,7 @@ def resting_heights(run: Run) -> NDArray:
 def test_the_hand_sees_first_how_a_long_object_hangs(lever: float, is_tried: bool):
     parameters = dataclasses.replace(PARAMETERS, heavy_load=8 * WEIGHT)
     world = World(levers=(lever,), touch_place=0.0)
-    run = Run(world, parameters=parameters).until(Mode.CARRY)
+    run = Run(world, parameters=parameters, is_logged=True).until(Mode.CARRY)
     rested = resting_heights(run) - GRASP_Z
     assert ((rested > 0.008) & (rested < 0.015)).any() == is_tried
     assert [item.outcome for item in run.finish().output("history")] == ["placed"]
@@ -412,9 +417,9 @@ def test_the_rim_check_allows_for_the_doubt_of_the_heights(doubt: float, follows
 
 
 def test_a_failed_search_ends_where_it_began():
-    run = Run(World(touch_place=ON_THE_RIM), answer=OVER_A_CAVITY, insertion=True).until(
-        Mode.RELEASE
-    )
+    run = Run(
+        World(touch_place=ON_THE_RIM), answer=OVER_A_CAVITY, insertion=True, is_logged=True
+    ).until(Mode.RELEASE)
     assert run.sequence[-2] == Mode.SEARCH
     q = run.output("desired_motion")[:4]
     assert q[2] == pytest.approx(ON_THE_RIM, abs=2.5e-3)
@@ -493,7 +498,7 @@ def test_heights_come_from_the_action_or_else_from_the_observation():
 @pytest.mark.parametrize("tallest", [0.05, 0.16])
 def test_travel_clears_the_highest_surface(tallest: float):
     """Except for the last two centimetres, over the surfaces around the goal."""
-    run = Run(observation=seen(pick=0.06, place=0.03, tallest=tallest)).finish()
+    run = Run(observation=seen(pick=0.06, place=0.03, tallest=tallest), is_logged=True).finish()
     q = run.log.FindLog(run.simulator.get_context()).data()[:3]
     times = run.log.FindLog(run.simulator.get_context()).sample_times()
     begins = {mode: time for time, mode in reversed(run.modes)}
@@ -713,7 +718,7 @@ def test_motion_is_smooth_and_within_the_limits_of_its_mode(answer: PickPlaceAct
 
 
 def test_reset_and_rerun_give_equal_logs():
-    run = Run().finish()
+    run = Run(is_logged=True).finish()
     context = run.simulator.get_mutable_context()
     first = run.log.FindLog(context).data().copy()
     counts, modes = run.counts, run.modes
