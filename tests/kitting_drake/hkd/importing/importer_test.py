@@ -208,7 +208,8 @@ def test_an_ambiguous_length_lists_its_readings(
     assert true_length(length, height, unit, 90.0)[0] == 90.0
 
 
-@pytest.mark.parametrize("smaller", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("smaller", [False, True])
 def test_a_long_open_mesh_is_repaired_and_keeps_its_length(smaller: bool, tmp_path: Path):
     mesh = mallet()
     mesh.apply_scale(1.9)
@@ -243,13 +244,17 @@ def test_a_drive_socket_keeps_its_length(tmp_path: Path):
     assert report.record["mass"] == pytest.approx(7850e-9 * socket.volume(), rel=1e-3)
 
 
-def test_a_tool_weighs_what_the_scale_says(plain: importer.ImportReport, tmp_path: Path):
+@pytest.mark.slow
+def test_a_wooden_tool_is_light(tmp_path: Path):
     path = exported(mallet(), tmp_path / "mallet.stl")
-    volume = 1e-9 * mallet().volume
     wooden = bring(path, tmp_path / "tools", material="wood")
-    assert wooden.record["mass"] == pytest.approx(700 * volume, rel=1e-4)
+    assert wooden.record["mass"] == pytest.approx(700e-9 * mallet().volume, rel=1e-4)
     assert wooden.record["center_of_mass"][0] < 0.05
     assert not any("steel" in note or "guess" in note for note in wooden.notes)
+
+
+def test_a_tool_weighs_what_the_scale_says(plain: importer.ImportReport, tmp_path: Path):
+    path = exported(mallet(), tmp_path / "mallet.stl")
     weighed = bring(path, tmp_path / "tools", mass_g=123.0)
     assert weighed.record["mass"] == pytest.approx(0.123, abs=1e-6)
     assert weighed.record["center_of_mass"] == plain.record["center_of_mass"]

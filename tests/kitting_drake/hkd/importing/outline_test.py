@@ -163,6 +163,7 @@ def bring(path: Path, **options: float) -> ImportReport:
     return import_tool(request, time_limit=None)
 
 
+@pytest.mark.slow
 def test_an_outline_becomes_a_tool_of_its_size(tmp_path: Path):
     path = drawing(tmp_path, '<rect width="110" height="14"/><circle cx="8" cy="7" r="3"/>')
     tool = load_tool(str(bring(path, height_mm=12.0).directory))

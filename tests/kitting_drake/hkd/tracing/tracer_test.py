@@ -79,6 +79,7 @@ def test_an_oblique_photo_gives_the_true_outline(
     )
 
 
+@pytest.mark.slow
 def test_several_tools_are_numbered_from_the_left_and_have_heights_of_their_own(tmp_path: Path):
     bar = PlacedTool(CrossSection.square((20, 90)).translate((250, 60)), 25, ("red", "red"))
     path = photo_of(tmp_path, spanner(8), bar, tilt=5, size=FINE)
@@ -173,7 +174,8 @@ def test_close_neighbours_may_be_one_tool_until_their_gap_is_corrected(tmp_path:
         for y in (80, 110)
     ]
     path = photo_of(tmp_path, *bars)
-    lower, upper = traced(path, heights_mm=(8.0,)).tools
+    lower, upper = traced(path, heights_mm=(8.0,), name="set").tools
+    assert {lower.name, upper.name} == {"set_1", "set_2"}
     (gap,) = upper.doubts
     assert gap.place == pytest.approx((150, 105), abs=3)
     assert lower.doubts == upper.doubts
