@@ -23,6 +23,10 @@ _LEAST_TOOL_MM2 = 60.0
 _FLAT_MM = 0.03
 _EDGE_SLACK_MM = 0.4
 """Half the width, in mm, up to which a strip in which two masks differ is ignored."""
+_BORDER_SLACK_MM = 3.3
+"""The width in mm of the strip in which a border lies that blends into a shadow."""
+_STRETCH_GAP_MM = 2.0
+"""The largest gap between the parts of one stretch of unclear border, in mm."""
 
 
 @dataclass(frozen=True)
@@ -81,24 +85,38 @@ def find_silhouettes(
     soft = soft_mask(cv2, photo, mask)
     area = _cleaned(contours(photo, soft))
     differ = (mask ^ masks.mask(BOLD)) | masks.shine(mask)
-    unclear = _unclear(cv2, photo, differ)
+    unclear = [*_unclear(cv2, photo, differ), *_blended(cv2, photo, masks.blended(mask))]
+    unclear.sort(key=lambda item: -item.area)
     return area, _blur_mm(cv2, soft, mask, ppm), unclear
 
 
 def _unclear(cv2: Any, photo: RectifiedPhoto, differ: Array) -> list[Unclear]:
-    """Returns the regions of a mask (rows, columns) that are not narrow, the largest first."""
+    """Returns the regions of a mask (rows, columns) that are not narrow."""
     ppm = photo.px_per_mm
     radius = max(1, round(_EDGE_SLACK_MM * ppm))
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
     differ = cv2.morphologyEx(differ, cv2.MORPH_OPEN, disc)
     _, _, stats, centres = cv2.connectedComponentsWithStats(differ, connectivity=8)
     areas = stats[1:, cv2.CC_STAT_AREA] / ppm**2
-    places = photo.to_mm(centres[1:]) if len(areas) else centres[1:]
-    found = [
+    return _unclear_at(photo, centres[1:], areas)
+
+
+def _blended(cv2: Any, photo: RectifiedPhoto, border: Array) -> list[Unclear]:
+    """Returns the stretches of an unclear border, given as a mask (rows, columns)."""
+    ppm = photo.px_per_mm
+    radius = max(1, round(_STRETCH_GAP_MM / 2 * ppm))
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+    _, labels, stats, centres = cv2.connectedComponentsWithStats(cv2.dilate(border, disc))
+    lengths = np.bincount(labels[border > 0], minlength=len(stats))[1:] / ppm
+    return _unclear_at(photo, centres[1:], _BORDER_SLACK_MM * lengths)
+
+
+def _unclear_at(photo: RectifiedPhoto, pixels: Array, areas: Array) -> list[Unclear]:
+    places = photo.to_mm(pixels) if len(areas) else pixels
+    return [
         Unclear((float(x), float(y)), float(area))
         for (x, y), area in zip(places, areas, strict=True)
     ]
-    return sorted(found, key=lambda item: -item.area)
 
 
 def _rectangle(low: Array | float, high: Array) -> Array:

@@ -29,8 +29,17 @@ _SHINY, _SHINY_SHARE = 0.06, 0.25
 """A bay or hole of a tool's mask is a reflection if more than `_SHINY_SHARE` of it is brighter than
 the ground by more than `_SHINY`, in logarithms of light."""
 _SHINE_REACH_MM = 3.0
+_GLARE, _GLARE_SPREADS = 0.025, 5.0
+"""The least brightness of glare above the ground, in logarithms of light and in standard deviations
+of the ground's light."""
+_GLARE_REACH_MM, _GLARE_GAP_MM, _GLARE_MM2, _GLARE_SHARE = 8.0, 2.5, 0.7, 0.25
+"""How far glare reaches from the rest of its tool, half the width of the strip between the two, the
+least area, and the share of an added region that must be brighter than the ground."""
 _BAY_MM = 12.0
 """Half the largest width, in mm, of the bays and holes that may be reflections."""
+_BLENDED_MM, _SHADED = 1.2, 0.06
+"""The width of a step of light, in mm, above which a tool blends into what is beside it; and the
+least darkness of a shadow, in logarithms of light."""
 _NEUTRAL = 0.05
 _LARGEST_HOLE_MM2 = 500.0
 """The area in mm^2 above which a hole must show ground that is not in shadow."""
@@ -96,6 +105,7 @@ class ToolMasks:
             px_per_mm: the resolution.
         """
         self._cv2, self._ground, self._px_per_mm = cv2, ground, px_per_mm
+        self._spread = spread
         self._smooth = cv2.GaussianBlur(ratio, (0, 0), 0.12 * px_per_mm + 0.3)
         self._lightness, self._colour = _lightness_and_colour(cv2, self._smooth)
         self._steep = _steepness(cv2, self._smooth, px_per_mm)
@@ -143,7 +153,7 @@ class ToolMasks:
             reached |= grown & free
         tool = _components(cv2, (~reached).astype(np.uint8), self._evidence, px_per_mm)
         widest = look.shine * max(1.0, _FINE_PX_PER_MM / px_per_mm)
-        return self._bordered(self._without_shine(tool, widest))
+        return self._bordered(self._with_glare(self._without_shine(tool, widest)))
 
     def shine(self, mask: Array) -> Array:
         """Returns a mask (rows, columns): 1 for the pixels beside a given mask that are too bright.
@@ -154,6 +164,40 @@ class ToolMasks:
         near = cv2.dilate(mask, _disc(cv2, _SHINE_REACH_MM * self._px_per_mm))
         bright = (self._lightness > 2 * _SHINY * self._noise) & self._ground
         return ((near > mask) & bright).astype(np.uint8)
+
+    def blended(self, mask: Array) -> Array:
+        """Returns the border pixels of a mask (rows, columns) at which the tool blends into a
+        shadow."""
+        cv2 = self._cv2
+        border = (mask > 0) & (cv2.erode(mask, _disc(cv2, 1)) == 0)
+        widest = _BLENDED_MM * max(1.0, _FINE_PX_PER_MM / self._px_per_mm)
+        outside = (mask == 0).astype(np.float32)
+        side = 2 * round(_STEP_REACH_MM * self._px_per_mm) + 1
+        count = np.maximum(cv2.blur(outside, (side, side)), 1e-3)
+        shaded = cv2.blur(self._lightness * outside, (side, side)) < -_SHADED * count
+        return (border & shaded & (self._width > widest)).astype(np.uint8)
+
+    def _with_glare(self, tool: Array) -> Array:
+        """Adds the regions beside a tool where it shines more brightly than the ground.
+
+        No light makes the ground beside a tool brighter. Between tool and glare, the shine is as
+        bright as the ground; this strip is added, too.
+        """
+        cv2, px_per_mm = self._cv2, self._px_per_mm
+        least = max(_GLARE, _GLARE_SPREADS * self._spread)
+        bright = ((self._lightness > least) & self._ground).astype(np.uint8)
+        bright = cv2.morphologyEx(bright, cv2.MORPH_OPEN, _disc(cv2, 0.2 * px_per_mm))
+        bright &= cv2.dilate(tool, _disc(cv2, _GLARE_REACH_MM * px_per_mm))
+        both = cv2.morphologyEx(
+            tool | bright, cv2.MORPH_CLOSE, _disc(cv2, _GLARE_GAP_MM * px_per_mm)
+        )
+        added = both & ~tool & 1
+        # Keep the strips that lead to glare, and no notches that the closing has filled.
+        _, labels, stats, _ = cv2.connectedComponentsWithStats(added, connectivity=4)
+        share = np.bincount(labels[bright > 0], minlength=len(stats)) / np.maximum(stats[:, 4], 1)
+        kept = (share > _GLARE_SHARE) & (stats[:, 4] > _GLARE_MM2 * px_per_mm**2)
+        kept[0] = False
+        return tool | kept[labels].astype(np.uint8)
 
     def _without_shine(self, tool: Array, widest: float) -> Array:
         """Fills the bays and holes of a mask that are reflections on a tool.
