@@ -1,7 +1,7 @@
 """`python -m kitting_drake.benchmark NAME`: measures, prints tables and saves them.
 
-NAME is simulation, networks, kits, recovery, endurance, reliability, reach, mujoco, trace, fits or
-paper.
+NAME is simulation, networks, kits, recovery, endurance, reliability, reach, mujoco, trace,
+traced_kits, fits or paper.
 """
 
 import argparse
@@ -40,6 +40,7 @@ def main() -> int:
         "mujoco": _mujoco,
         "reliability": _reliability,
         "trace": _trace,
+        "traced_kits": _traced_kits,
         "reach": _reach,
     }[arguments.benchmark]
     for table in measure(arguments, console, folder):
@@ -64,6 +65,7 @@ def _parser() -> argparse.ArgumentParser:
         _add_mujoco,
         _add_reliability,
         _add_trace,
+        _add_traced_kits,
         _add_reach,
         _add_paper,
     ):
@@ -207,6 +209,18 @@ def _add_trace(benchmarks: Any) -> None:
         "--keep", action="store_true", help="keep the photos and pictures in the folder photos"
     )
     tracing.add_argument("--seed", type=int, default=0, help="seed of the photos (default: 0)")
+
+
+def _add_traced_kits(benchmarks: Any) -> None:
+    traced = benchmarks.add_parser(
+        "traced_kits",
+        help="success of the oracle with true tools in cavities traced from drawn photos; resumes",
+    )
+    traced.add_argument("--kits", type=count_type, default=10, help="number of kits (10)")
+    traced.add_argument(
+        "--fit", choices=("snug", "easy", "loose"), default="easy", help="the clearance (easy)"
+    )
+    traced.add_argument("--seed", type=seed_type, default=0, help="seed of photos and scenes (0)")
 
 
 def _add_reach(benchmarks: Any) -> None:
@@ -414,6 +428,20 @@ def _trace(arguments: argparse.Namespace, console: Console, folder: Path) -> lis
     )
     write_json(folder / "trace.json", measured)
     return [trace_table(measured)]
+
+
+def _traced_kits(arguments: argparse.Namespace, console: Console, folder: Path) -> list[Table]:
+    from kitting_drake.reproduction.benchmarks.traced_kits import (
+        measure_traced_kits,
+        traced_kits_table,
+    )
+
+    with alone_in(folder):
+        measured = measure_traced_kits(
+            arguments.kits, arguments.seed, arguments.fit, folder, console
+        )
+        write_json(folder / "traced_kits.json", measured)
+    return [traced_kits_table(measured)]
 
 
 def _mujoco(arguments: argparse.Namespace, console: Console, folder: Path) -> list[Table]:

@@ -4,7 +4,7 @@ import base64
 import html
 import json
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ import numpy as np
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import write_atomically, write_json
+from kitting_drake.common.processes import LocalWorkers, ProcessCrashed, side_by_side
 from kitting_drake.common.rendering import add_picture_renderer, png_bytes, render_picture
 from kitting_drake.episode.chosen import build_chosen, run_chosen
 from kitting_drake.evaluation.intervals import proportion_interval
@@ -25,6 +26,8 @@ _TIGHT = ("insertion blocked", "misplaced", _OFF)
 """The causes of failures that a wider cavity may mend."""
 GOOD = 0.95
 """A kit fits if at least this share of the tools is kitted."""
+_CLEARLY = 3
+"""The least number of failures after which a kit may be given up."""
 _WIDER = (1.5, 2.25)
 """Clearances that are tried for a kit that does not fit, as multiples of the kit's own
 clearance."""
@@ -77,6 +80,17 @@ class ToolProof:
 
 
 @dataclass
+class _Outcome:
+    """The results of one episode."""
+
+    tools: list[ToolProof] = field(default_factory=list)
+    pictures: list[bytes] = field(default_factory=list)
+    """Pictures of the start and the end as PNG, if they were drawn."""
+    failure: str | None = None
+    """Why the episode could not be run; None if it was."""
+
+
+@dataclass
 class KitProof:
     """The results of all episodes with one clearance."""
 
@@ -84,6 +98,8 @@ class KitProof:
     tools: dict[str, ToolProof] = field(default_factory=dict)
     pictures: list[bytes] = field(default_factory=list)
     """Pictures of the start and the end of the first episode, as PNG."""
+    episodes: int = 0
+    """The number of episodes counted."""
 
     @property
     def kitted(self) -> int:
@@ -101,24 +117,53 @@ class KitProof:
         return self.kitted >= GOOD * self.tried
 
     @property
+    def is_hopeless(self) -> bool:
+        """Whether so many tools failed that the kit certainly does not fit."""
+        if self.tried - self.kitted < _CLEARLY:
+            return False
+        return proportion_interval(self.kitted, self.tried)[1] < GOOD
+
+    def add(self, outcome: _Outcome) -> None:
+        """Counts an episode."""
+        self.episodes += 1
+        self.pictures = self.pictures or outcome.pictures
+        for item in outcome.tools:
+            tool = self.tools.setdefault(item.name, ToolProof(item.name))
+            tool.kitted += item.kitted
+            tool.tried += item.tried
+            tool.peak_force_n = max(tool.peak_force_n, item.peak_force_n)
+            tool.causes += item.causes
+
+    @property
     def may_be_tight(self) -> bool:
         """Whether the kit does not fit, but might if no tool got stuck in its cavity."""
         stuck = sum(tool.causes[cause] for tool in self.tools.values() for cause in _TIGHT)
         return not self.fits and self.kitted + stuck >= GOOD * self.tried
 
 
-def prove_kit(folder: Path, episodes: int, progress: Progress) -> str:
+def prove_kit(
+    folder: Path,
+    episodes: int,
+    progress: Progress,
+    *,
+    tools: Sequence[str] = (),
+    workers: int = 1,
+) -> str:
     """Lets a policy fill a kit in simulation, and writes `proof.html` and `proof.json` into its
     folder.
 
     The policy is that of the kit's scenario. In each episode the tools lie elsewhere, and all
     cavities are wider or narrower by a common random error of `TOLERANCE_MM`. A kit that does not
-    fit is tried again with wider cavities, if these may mend its failures.
+    fit is tried again with wider cavities, if these may mend its failures. A clearance that
+    certainly does not fit is given up before the last episode.
 
     Args:
         folder: a folder that `hkd kit` wrote.
         episodes: number of simulated episodes.
-        progress: a function that is called before each episode and at the end.
+        progress: a function that is called before the first and after each episode.
+        tools: names or folders of the tools to put into the cavities, one for each cavity; by
+            default those for which the cavities were made.
+        workers: the number of processes that run episodes.
 
     Returns:
         The verdict, in a sentence or two.
@@ -129,14 +174,17 @@ def prove_kit(folder: Path, episodes: int, progress: Progress) -> str:
     record = json.loads((folder / "kit.json").read_text())
     own = 1e3 * float(record["kit_parameters_m"]["clearance"])
     fits = dict(record["kit_parameters_m"].get("clearance_of", {}))
-    proof = _prove(folder, own, episodes, progress, fits)
-    wider: list[KitProof] = []
-    for factor in _WIDER if proof.may_be_tight else ():
-        clearance = round(max(factor * own, own + _LEAST_WIDER_MM * (len(wider) + 1)), 2)
-        more = {name: value + 1e-3 * (clearance - own) for name, value in fits.items()}
-        wider.append(_prove(folder, clearance, episodes, progress, more))
-        if wider[-1].fits:
-            break
+    cavities = [tool["path"] for tool in record["tools"]]
+    task: dict[str, Any] = {"tools": list(tools), "cavities": cavities} if tools else {}
+    with LocalWorkers(min(workers, episodes)) as processes:
+        proof = _prove(folder, own, episodes, progress, fits, task, processes)
+        wider: list[KitProof] = []
+        for factor in _WIDER if proof.may_be_tight else ():
+            clearance = round(max(factor * own, own + _LEAST_WIDER_MM * (len(wider) + 1)), 2)
+            more = {name: value + 1e-3 * (clearance - own) for name, value in fits.items()}
+            wider.append(_prove(folder, clearance, episodes, progress, more, task, processes))
+            if wider[-1].fits:
+                break
     verdict = _verdict(proof, wider)
     # Record the names before the files are written, so that a later `hkd kit` may replace them.
     record["files"] = sorted({*record["files"], *_FILES})
@@ -146,6 +194,7 @@ def prove_kit(folder: Path, episodes: int, progress: Progress) -> str:
         {
             "verdict": verdict,
             "tolerance_mm": TOLERANCE_MM,
+            "proved_with": list(tools) or cavities,
             "clearances": [
                 {
                     "clearance_mm": item.clearance_mm,
@@ -167,50 +216,80 @@ def _prove(
     episodes: int,
     progress: Progress,
     clearance_of: Mapping[str, float],
+    task: Mapping[str, Any],
+    workers: LocalWorkers,
 ) -> KitProof:
-    proof = KitProof(clearance_mm)
-    for seed in range(episodes):
-        progress(f"clearance {clearance_mm:g} mm", seed, episodes)
-        error = float(np.random.default_rng([seed, 23]).normal(0.0, TOLERANCE_MM))
-        drawn = {
-            name: round(max(value + 1e-3 * error, 0.0), 6)
-            for name, value in {"": 1e-3 * clearance_mm, **clearance_of}.items()
-        }
-        kit: dict[str, Any] = {"clearance": drawn.pop("")}
-        if drawn:
-            kit["clearance_of"] = drawn
-        text = json.dumps({"task": {"kit": kit}})
+    proof, queue = KitProof(clearance_mm), iter(range(episodes))
+    waiting: dict[int, _Outcome] = {}
+    what = f"clearance {clearance_mm:g} mm"
+
+    def draw() -> tuple[int, str] | None:
+        seed = None if proof.is_hopeless else next(queue, None)
+        if seed is None:
+            return None
+        kit = _drawn_kit(seed, clearance_mm, clearance_of)
+        return seed, json.dumps({"task": {**task, "kit": kit}})
+
+    def run(item: tuple[int, str]) -> tuple[int, _Outcome | ProcessCrashed]:
+        return item[0], workers.run(_run_episode, folder, *item)
+
+    progress(what, 0, episodes)
+    for ended, (seed, outcome) in enumerate(side_by_side(run, draw, workers=workers), start=1):
+        if isinstance(outcome, ProcessCrashed):
+            raise UserError(f"the simulation of the kit ended with exit code {outcome.exit_code}")
+        if outcome.failure:
+            raise UserError(f"the simulation of the kit failed: {outcome.failure}")
+        waiting[seed] = outcome
+        # Count the episodes in order, so that the result does not depend on which ends first.
+        while proof.episodes in waiting and not proof.is_hopeless:
+            proof.add(waiting.pop(proof.episodes))
+        progress(what, ended, episodes)
+    return proof
+
+
+def _drawn_kit(seed: int, clearance_mm: float, clearance_of: Mapping[str, float]) -> dict[str, Any]:
+    """The clearances of an episode, as fields of a scenario's `kit`."""
+    error = float(np.random.default_rng([seed, 23]).normal(0.0, TOLERANCE_MM))
+    drawn = {
+        name: round(max(value + 1e-3 * error, 0.0), 6)
+        for name, value in {"": 1e-3 * clearance_mm, **clearance_of}.items()
+    }
+    kit: dict[str, Any] = {"clearance": drawn.pop("")}
+    if drawn:
+        kit["clearance_of"] = drawn
+    return kit
+
+
+def _run_episode(folder: Path, seed: int, text: str) -> _Outcome:
+    """Runs one episode of a kit; the first one with pictures."""
+    try:
         chosen = find_scenario(folder / "scenario.yaml", None, text, None)
         diagram, station = build_chosen(chosen, seed=seed)
-        pictured = seed == 0
-        if pictured:
-            add_picture_renderer(station.scene_graph)
-        frames: list[bytes] = []
+    except UserError as error:
+        return _Outcome(failure=str(error))
+    frames: list[bytes] = []
 
-        def observe(event: Any, station: Any = station, frames: list[bytes] = frames) -> None:
-            if not frames or event.is_stop:
-                context = station.scene_graph.GetMyContextFromRoot(event.root_context)
-                picture = render_picture(station.scene_graph, context, station.X_WOverview)
-                frames.append(png_bytes(picture))
+    def observe(event: Any) -> None:
+        if not frames or event.is_stop:
+            context = station.scene_graph.GetMyContextFromRoot(event.root_context)
+            picture = render_picture(station.scene_graph, context, station.X_WOverview)
+            frames.append(png_bytes(picture))
 
-        result = run_chosen(chosen, diagram, station, observers=[observe] if pictured else [])
-        if result.failure:
-            raise UserError(f"the simulation of the kit failed: {result.failure}")
-        if pictured:
-            proof.pictures = [frames[0], frames[-1]]
-        for item in result.objects:
-            tool = proof.tools.setdefault(item.name, ToolProof(item.name))
-            tool.tried += 1
-            tool.kitted += item.strict_success
-            if not item.strict_success:
-                tool.causes[item.cause or _OFF] += 1
-        for action in result.actions_taken:
-            force = action.peak_force_n
-            if action.object in proof.tools and force is not None:
-                tool = proof.tools[action.object]
-                tool.peak_force_n = max(tool.peak_force_n, force.vertical, force.lateral)
-    progress(f"clearance {clearance_mm:g} mm", episodes, episodes)
-    return proof
+    pictured = seed == 0
+    if pictured:
+        add_picture_renderer(station.scene_graph)
+    result = run_chosen(chosen, diagram, station, observers=[observe] if pictured else [])
+    tools = {}
+    for item in result.objects:
+        tool = tools.setdefault(item.name, ToolProof(item.name, int(item.strict_success), 1))
+        if not item.strict_success:
+            tool.causes[item.cause or _OFF] += 1
+    for action in result.actions_taken:
+        force = action.peak_force_n
+        if action.object in tools and force is not None:
+            tool = tools[action.object]
+            tool.peak_force_n = max(tool.peak_force_n, force.vertical, force.lateral)
+    return _Outcome(list(tools.values()), [frames[0], frames[-1]] if frames else [], result.failure)
 
 
 def _verdict(proof: KitProof, wider: list[KitProof]) -> str:

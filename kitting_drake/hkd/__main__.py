@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,6 +21,7 @@ from kitting_drake.hkd.generation.catalogue import ToolEntry, load_catalogue
 from kitting_drake.hkd.generation.generate import generate_tool
 from kitting_drake.hkd.generation.part_models import load_named
 from kitting_drake.hkd.listing import chosen_entries, chosen_with_own, print_tools, size_text
+from kitting_drake.hkd.proving import describe_proof, tools_to_prove
 from kitting_drake.hkd.tools.tool import CATEGORIES
 from kitting_drake.hkd.tools.toolsets import SPLITS, toolsets
 from kitting_drake.hkd.tracing.command import describe_trace, trace_photo
@@ -135,6 +137,9 @@ def kit(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
     from kitting_drake.hkd.fabrication.export import export_kit
 
     request = request_of(args, "" if args.robot is None else _robot_text(args.robot))
+    true_tools = tools_to_prove(args.tools, args.prove_with)
+    if true_tools and not args.prove:
+        raise UserError("--prove_with needs --prove")
     if args.prove:
         # Check early, so that missing libraries are reported before any work.
         from kitting_drake.common.rendering import require_rendering
@@ -156,10 +161,12 @@ def kit(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
         console.print(f"  {note}", soft_wrap=True)
     has_room = _check_scenario(args.output / "scenario.yaml", console)
     if args.prove and has_room:
-        _prove(args.output, args.prove, console)
+        _prove(args.output, args.prove, true_tools, args.workers or os.cpu_count() or 1, console)
 
 
-def _prove(folder: Path, episodes: int, console: Console) -> None:
+def _prove(
+    folder: Path, episodes: int, true_tools: list[str], workers: int, console: Console
+) -> None:
     from kitting_drake.evaluation.kit_proof import prove_kit
 
     with Console(stderr=True, quiet=console.quiet).status("proving the kit") as status:
@@ -167,7 +174,7 @@ def _prove(folder: Path, episodes: int, console: Console) -> None:
         def progress(what: str, done: int, total: int) -> None:
             status.update(f"proving the kit: {what}, {done} of {total} episodes")
 
-        verdict = prove_kit(folder, episodes, progress)
+        verdict = prove_kit(folder, episodes, progress, tools=true_tools, workers=workers)
     console.print(f"{verdict}\nproof: {folder}/proof.html", soft_wrap=True)
 
 
@@ -296,6 +303,7 @@ def main() -> int:
     tracer.set_defaults(function=trace)
     maker = verbs.add_parser("kit", help=kit.__doc__)
     describe_kit(maker)
+    describe_proof(maker)
     maker.set_defaults(function=kit)
     args = parser.parse_args()
     models = getattr(args, "models", MODELS)

@@ -33,7 +33,12 @@ xmlns="http://schemas.microsoft.com/3dmanufacturing/core/2015/02">
  <metadata name="Title">{title}</metadata>
  <metadata name="Application">kitting_drake</metadata>
  <resources>
-  <object id="1" type="model" name={name}>
+{resources}
+ </resources>
+ <build><item objectid="{built}"/></build>
+</model>
+"""
+_OBJECT = """  <object id="{number}" type="model" name={name}{material}>
    <mesh>
     <vertices>
 {vertices}
@@ -42,11 +47,14 @@ xmlns="http://schemas.microsoft.com/3dmanufacturing/core/2015/02">
 {triangles}
     </triangles>
    </mesh>
-  </object>
- </resources>
- <build><item objectid="1"/></build>
-</model>
-"""
+  </object>"""
+_COLOURS = """  <basematerials id="4">
+   <base name="block" displaycolor="#2B2E33"/>
+   <base name="labels" displaycolor="#F29E1A"/>
+  </basematerials>"""
+_BOTH = """  <object id="3" type="model" name={name}>
+   <components><component objectid="1"/><component objectid="2"/></components>
+  </object>"""
 
 
 def stl_bytes(surface: Triangles) -> bytes:
@@ -56,19 +64,28 @@ def stl_bytes(surface: Triangles) -> bytes:
     return data
 
 
-def threemf_bytes(surface: Triangles, title: str) -> bytes:
+def threemf_bytes(surface: Triangles, title: str, labels: Triangles | None = None) -> bytes:
     """Encodes a triangle surface as a 3MF archive with one object (3MF core specification 1.3).
 
     trimesh's own 3MF export is not used, because it needs lxml and writes no unit.
+
+    Args:
+        surface: the block.
+        title: the title.
+        labels: letters of another colour that fill the engraved ones. The object then has two
+            parts, each with its own base material.
     """
-    vertices, faces = surface
-    corners = "\n".join(
-        f'     <vertex x="{x:.4f}" y="{y:.4f}" z="{z:.4f}"/>' for x, y, z in vertices
-    )
-    triangles = "\n".join(f'     <triangle v1="{a}" v2="{b}" v3="{c}"/>' for a, b, c in faces)
-    model = _MODEL.format(
-        title=escape(title), name=quoteattr(title), vertices=corners, triangles=triangles
-    )
+    if labels is None:
+        resources, built = [_object(1, title, surface, "")], 1
+    else:
+        resources = [
+            _COLOURS,
+            _object(1, title, surface, ' pid="4" pindex="0"'),
+            _object(2, f"{title}, labels", labels, ' pid="4" pindex="1"'),
+            _BOTH.format(name=quoteattr(title)),
+        ]
+        built = 3
+    model = _MODEL.format(title=escape(title), resources="\n".join(resources), built=built)
     archive = io.BytesIO()
     with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as file:
         for path, text in (
@@ -80,3 +97,16 @@ def threemf_bytes(surface: Triangles, title: str) -> bytes:
             entry.compress_type = zipfile.ZIP_DEFLATED
             file.writestr(entry, text)
     return archive.getvalue()
+
+
+def _object(number: int, name: str, surface: Triangles, material: str) -> str:
+    vertices, faces = surface
+    return _OBJECT.format(
+        number=number,
+        name=quoteattr(name),
+        material=material,
+        vertices="\n".join(
+            f'     <vertex x="{x:.4f}" y="{y:.4f}" z="{z:.4f}"/>' for x, y, z in vertices
+        ),
+        triangles="\n".join(f'     <triangle v1="{a}" v2="{b}" v3="{c}"/>' for a, b, c in faces),
+    )

@@ -9,7 +9,7 @@ import numpy as np
 from manifold3d import CrossSection, JoinType, Manifold
 from numpy.typing import NDArray
 
-from kitting_drake.hkd.fabrication.labels import engrave_labels
+from kitting_drake.hkd.fabrication.labels import DEPTH, engrave_labels
 from kitting_drake.hkd.fabrication.notches import cut_notches
 from kitting_drake.hkd.fabrication.outside import Outside, shaped
 from kitting_drake.hkd.fabrication.recess import Recess
@@ -111,6 +111,19 @@ def solid(design: Design) -> Manifold:
     block = block.simplify(_FINEST)
     corner = (parameters.length / 2, parameters.width / 2, 0.0)
     return shaped(block.translate(corner).scale((1e3, 1e3, 1e3)), design.outside)
+
+
+def letters(design: Design) -> Manifold:
+    """Returns the letters that fill the engraved labels, in the frame of the files, in mm."""
+    parameters = design.kit.parameters
+    filled = Manifold()
+    for recess in design.recesses:
+        if recess.kind == "label":
+            body = Manifold.extrude(recess.outline, DEPTH)
+            filled += body.translate((0, 0, recess.floor))
+    corner = (parameters.length / 2, parameters.width / 2, 0.0)
+    filled = filled.simplify(_FINEST).translate(corner).scale((1e3, 1e3, 1e3))
+    return filled.translate((0, 0, design.outside.raised_mm))
 
 
 def surface(solid: Manifold) -> tuple[NDArray[np.float64], NDArray[np.int64]]:

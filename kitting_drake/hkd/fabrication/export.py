@@ -21,6 +21,7 @@ from kitting_drake.hkd.fabrication.block_files import stl_bytes, threemf_bytes
 from kitting_drake.hkd.fabrication.design import (
     Design,
     design_kit,
+    letters,
     openings,
     solid,
     surface,
@@ -41,6 +42,7 @@ from kitting_drake.hkd.fabrication.kit_request import (
     check_request,
     kit_parameters,
 )
+from kitting_drake.hkd.fabrication.labels import DEPTH
 from kitting_drake.hkd.fabrication.outside import Outside, foot_sections
 from kitting_drake.hkd.fabrication.picture import picture_png, sheet_png
 from kitting_drake.hkd.fabrication.splitting.assembly_picture import assembly_png
@@ -73,6 +75,8 @@ class KitFiles:
     design: Design
     block: Manifold
     """The block in the frame of the files, in mm."""
+    letters: Manifold | None
+    """The letters of a second colour, in the same frame; None: there are none."""
     split: Split | None
     """The pieces of the block. None: the block is not split."""
     sheet: FoamSheet | None
@@ -141,7 +145,10 @@ def _made(request: KitRequest, kit: Kit, others: Sequence[SheetKit]) -> KitFiles
             wanted.size_mm, wanted.margin_mm, wanted.gap_mm, [own, *others], wanted.copies
         )
         notes += sheet.notes
-    return KitFiles(design, block, split, sheet, tuple(notes))
+    filled = letters(design) if request.two_colours else None
+    if filled is not None and filled.is_empty():
+        filled = None
+    return KitFiles(design, block, filled, split, sheet, tuple(notes))
 
 
 def _check_replaceable(folder: Path) -> None:
@@ -168,12 +175,18 @@ def _write(folder: Path, made: KitFiles, parameters: KitParameters, robot: str) 
     """Writes a kit's files into an empty folder."""
     design = made.design
     title = f"Kit of {', '.join(tool.name for tool in design.kit.tools)}"
-    _write_solid(folder / "kit", made.block, title)
+    _write_solid(folder / "kit", made.block, title, made.letters)
+    if made.letters is not None:
+        (folder / "labels.stl").write_bytes(stl_bytes(surface(made.letters)))
     if made.split is not None:
         for piece in made.split.pieces:
             x, y, z = (-float(v) for v in piece.corner)
             name = f"piece_{piece.number}"
-            _write_solid(folder / name, piece.body.translate((x, y, z)), f"{title}, {name}")
+            own = made.letters
+            if own is not None:
+                # Keep the letters that have material of this piece below them.
+                own = (own ^ piece.body.translate((0, 0, 1e3 * DEPTH))).translate((x, y, z))
+            _write_solid(folder / name, piece.body.translate((x, y, z)), f"{title}, {name}", own)
         (folder / "pieces.png").write_bytes(assembly_png(made.split, openings(design)))
     (folder / "test_piece.stl").write_bytes(stl_bytes(surface(test_piece())))
     (folder / "cavities.dxf").write_text(dxf_text(design))
@@ -193,13 +206,15 @@ def _write(folder: Path, made: KitFiles, parameters: KitParameters, robot: str) 
     write_json(folder / RECORD, {**record, "files": [*files, RECORD]})
 
 
-def _write_solid(stem: Path, solid: Manifold, title: str) -> None:
-    """Writes a solid in mm to `stem` with the suffixes .stl and .3mf."""
+def _write_solid(stem: Path, solid: Manifold, title: str, letters: Manifold | None = None) -> None:
+    """Writes a solid in mm to `stem` with the suffixes .stl and .3mf. The 3MF also has the letters
+    of a second colour."""
     triangles = surface(solid)
     stl = stl_bytes(triangles)
     _check_closed(stl)
     stem.with_suffix(".stl").write_bytes(stl)
-    stem.with_suffix(".3mf").write_bytes(threemf_bytes(triangles, title))
+    filled = None if letters is None or letters.is_empty() else surface(letters)
+    stem.with_suffix(".3mf").write_bytes(threemf_bytes(triangles, title, filled))
 
 
 def _check_closed(stl: bytes) -> None:

@@ -66,6 +66,8 @@ class KitRequest:
     """
     notches: bool = False
     labels: bool = False
+    two_colours: bool = False
+    """Whether the engraved labels are filled with letters of a second colour."""
     chamfer_mm: float = 0.0
     """The width of the bevel along the block's outer edges."""
     gridfinity: bool = False
@@ -226,6 +228,8 @@ def request_of(args: argparse.Namespace, robot: str) -> KitRequest:
     Raises:
         UserError: flags do not go together.
     """
+    if args.two_colours and not args.labels:
+        raise UserError("--two_colours needs --labels")
     if args.sheet is None and (args.beside or args.copies):
         raise UserError("--beside and --copies need --sheet")
     sheet = args.sheet and SheetRequest(
@@ -247,6 +251,7 @@ def request_of(args: argparse.Namespace, robot: str) -> KitRequest:
         block_mm=tuple(args.block_mm) if args.block_mm else None,
         notches=args.notches,
         labels=args.labels,
+        two_colours=args.two_colours,
         chamfer_mm=args.chamfer_mm,
         gridfinity=args.base == "gridfinity",
         nozzle_mm=args.nozzle_mm,
@@ -281,15 +286,6 @@ def describe_kit(maker: argparse.ArgumentParser) -> None:
     _describe_cavities(maker)
     _describe_block(maker)
     _describe_sheet(maker)
-    maker.add_argument(
-        "--prove",
-        type=count_type,
-        nargs="?",
-        const=10,
-        metavar="N",
-        help="simulate the kitting N times (10 if N is left out) with the errors of a printer, "
-        "and write proof.html",
-    )
     maker.add_argument(
         "--robot",
         type=Path,
@@ -342,6 +338,11 @@ def _describe_cavities(maker: argparse.ArgumentParser) -> None:
     )
     maker.add_argument("--notches", action="store_true", help="add finger notches")
     maker.add_argument("--labels", action="store_true", help="engrave the tools' names")
+    maker.add_argument(
+        "--two_colours",
+        action="store_true",
+        help="fill the engraved names with letters of a second colour (3MF, labels.stl)",
+    )
 
 
 def _describe_block(maker: argparse.ArgumentParser) -> None:

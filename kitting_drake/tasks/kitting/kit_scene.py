@@ -1,5 +1,6 @@
 """Makes the scene of kits and their tools."""
 
+import dataclasses
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,6 +10,8 @@ from pydrake.math import RigidTransform, RollPitchYaw
 
 from kitting_drake.hkd.grasps.all_grasps import carrying_grasps
 from kitting_drake.hkd.kits.kit import Kit
+from kitting_drake.hkd.kits.layout import cavity_outline
+from kitting_drake.hkd.kits.seating import find_seat
 from kitting_drake.hkd.tools.tool import Tool
 from kitting_drake.tasks.task import Fixture, Scene, SceneObject
 from systems.placement import AddS, Goal, is_tilted
@@ -64,7 +67,11 @@ def kitting_scene(
     for name, tool, index in zip(names, sorted_tools, order, strict=True):
         number, slot = place[int(index)]
         alike = tuple(i for i, other in enumerate(sorted_tools) if _are_alike(tool, other))
-        goals.append(_goal(name, kits[number], number, slot, alike, 1 / len(tools)))
+        goal = _goal(name, kits[number], number, slot, alike, 1 / len(tools))
+        kit = kits[number].kit
+        if kit.tools[slot] is not tool:
+            goal = dataclasses.replace(goal, poses=(goal.poses[0] @ _seat(tool, kit, slot),))
+        goals.append(goal)
     return Scene(
         objects=tuple(
             SceneObject(
@@ -110,6 +117,14 @@ def _goal(
         highest=highest,
         fixture=number,
     )
+
+
+def _seat(tool: Tool, kit: Kit, slot: int) -> RigidTransform:
+    """The pose of a seated tool in the frame of the tool for which its cavity was made."""
+    model = kit.tools[slot]
+    cavity = cavity_outline(model.footprint, kit.parameters.of_tool(model.name))
+    seat = find_seat(tool.footprint, model.footprint, cavity)
+    return RigidTransform(RollPitchYaw(0, 0, seat.yaw), [seat.x, seat.y, 0])
 
 
 def _are_alike(tool: Tool, other: Tool) -> bool:

@@ -153,14 +153,18 @@ class _DrawnKitting(KittingTask):
         lie apart on the table."""
         return () if self.start == APART and not self.tray else ("distractors",)
 
-    def _draw_scene(self, tools: list[Tool], grid: PixelGrid, seed: int) -> Scene:
+    def _draw_scene(
+        self, tools: list[Tool], grid: PixelGrid, seed: int, models: Sequence[Tool] = ()
+    ) -> Scene:
+        """Draws the scene of tools and their kits. The cavities are made for `models`, one for each
+        tool; if empty, for the tools themselves."""
         tools = self.fitted(self._weighted(tools, seed))
         if self.start != APART or self.tray:
             return self._draw_settled(self.kit_of(tools), tools, grid, seed)
         # Use separate random streams, so that with one level kit the poses do not depend on the
         # parameters of kits and risers.
         shares = self._shares(len(tools), np.random.default_rng([seed, 6]))
-        kits = [self.kit_of([tools[index] for index in share]) for share in shares]
+        kits = [self.kit_of([(models or tools)[index] for index in share]) for share in shares]
         stand_rng = np.random.default_rng([seed, 7])
         stands = [draw_stand(self.riser, self.tilt_deg, stand_rng) for _ in kits]
         rng = np.random.default_rng(seed)
@@ -291,21 +295,30 @@ class Kitting(_DrawnKitting):
         ]
     )
 
+    # The tools for which the cavities are made, one for each of `tools`, such as outlines traced
+    # from photos. If empty, the cavities are made for `tools` themselves.
+    cavities: list[str] = field(default_factory=list)
+
     @property
     def title(self) -> str:
         return SEEN if self == Kitting() else "kitting"
 
     def make_scene(self, *, grid: PixelGrid, seed: int, base: Path) -> Scene:
         tools = load_tools(self.tools, base)
+        models = load_tools(self.cavities, base, "task.cavities")
         check_grasps(tools, ANNOTATE)
-        return self._draw_scene(tools, grid, seed)
+        return self._draw_scene(tools, grid, seed, models)
 
     def input_files(self, base: Path) -> list[Path]:
-        return tool_files(self.tools, base)
+        return [*tool_files(self.tools, base), *tool_files(self.cavities, base)]
 
     def validate(self) -> None:
         super().validate()
         check_count(len(self.tools), self.kits)
+        if self.cavities and len(self.cavities) != len(self.tools):
+            raise ValueError("task.cavities must name one tool for each of task.tools")
+        if self.cavities and (self.start != APART or self.tray):
+            raise ValueError("task.cavities can be set only if task.start is apart, without a tray")
 
 
 @dataclass

@@ -1,5 +1,7 @@
 """What slicers and cutters check, on written kits."""
 
+import xml.etree.ElementTree as ElementTree
+import zipfile
 from pathlib import Path
 
 import ezdxf
@@ -12,6 +14,8 @@ from kitting_drake.hkd.fabrication.export import export_kit
 from kitting_drake.hkd.fabrication.kit_request import KitRequest, SheetRequest
 from kitting_drake.hkd.fabrication.splitting.opening import LEAST_WALL, corner_area, thin_parts
 from kitting_drake.hkd.tools.tool import tool_names
+
+CORE = "{http://schemas.microsoft.com/3dmanufacturing/core/2015/02}"
 
 
 def solid_of(path: Path) -> Manifold:
@@ -69,6 +73,7 @@ def test_slicers_and_cutters_find_nothing(gridfinity: bool, tmp_path: Path):
             tmp_path / "kit",
             notches=True,
             labels=True,
+            two_colours=True,
             chamfer_mm=0.6,
             gridfinity=gridfinity,
             bed_mm=(100.0, 100.0),
@@ -77,6 +82,37 @@ def test_slicers_and_cutters_find_nothing(gridfinity: bool, tmp_path: Path):
     )
     assert made.split is not None
     check_kit(tmp_path / "kit")
+    check_letters(tmp_path / "kit")
+
+
+def check_letters(folder: Path) -> None:
+    """Letters fill the engraved ones, in the whole block and in its pieces."""
+    letters, whole = (trimesh.load_mesh(folder / name) for name in ("labels.stl", "kit.stl"))
+    assert letters.is_watertight
+    block, filled = (
+        Manifold(Mesh64(np.array(mesh.vertices), mesh.faces.astype(np.uint64)))
+        for mesh in (whole, letters)
+    )
+    assert (block ^ filled).volume() < 1e-3 * filled.volume()
+    assert (block + filled).genus() == block.genus()
+    assert second_colour(folder / "kit.3mf") == pytest.approx(letters.volume, rel=1e-3)
+    pieces = sum(second_colour(path) for path in folder.glob("piece_*.3mf"))
+    assert pieces == pytest.approx(letters.volume, rel=1e-2)
+
+
+def second_colour(path: Path) -> float:
+    """The volume of the parts of a 3MF file that have the second base material."""
+    with zipfile.ZipFile(path) as file:
+        root = ElementTree.fromstring(file.read("3D/3dmodel.model"))
+    volume = 0.0
+    for item in root.iter(f"{CORE}object"):
+        if item.get("pindex") == "1":
+            corners = [[float(v.get(k)) for k in "xyz"] for v in item.iter(f"{CORE}vertex")]
+            faces = [
+                [int(t.get(k)) for k in ("v1", "v2", "v3")] for t in item.iter(f"{CORE}triangle")
+            ]
+            volume += trimesh.Trimesh(corners, faces).volume
+    return volume
 
 
 @pytest.mark.slow

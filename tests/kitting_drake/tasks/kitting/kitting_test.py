@@ -78,6 +78,17 @@ def test_poses_and_goals_follow_the_order():
         assert goal.rim_height == pytest.approx(Kitting().kit.height)
 
 
+def test_cavities_may_be_made_for_other_tools():
+    task = Kitting(tools=["bracket_60x36x12"], cavities=["bracket_61x37x12"], yaw_range_deg=0.0)
+    (goal,) = draw(0, task).goals
+    (model,) = draw(0, Kitting(tools=task.cavities, yaw_range_deg=0.0)).goals
+    moved = goal.poses[0].translation() - model.poses[0].translation()
+    # The smaller bracket has its place within the larger one's cavity.
+    assert 0.0 < np.linalg.norm(moved) < 2e-3
+    with pytest.raises(ValueError, match=r"task\.cavities must name one tool for each"):
+        Kitting(cavities=["claw_hammer"]).validate()
+
+
 def test_tools_at_their_goals_earn_the_whole_reward():
     scene = draw(1)
     assert (scene.max_actions, scene.goal_objects) == (4, (0, 1, 2, 3))

@@ -1,0 +1,166 @@
+"""Kits whose cavities are traced from drawn photos, filled with the true tools (`benchmark
+traced_kits`)."""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from kitting_drake.common.errors import UserError
+from kitting_drake.common.files import append_line, claim_folder, read_lines
+from kitting_drake.common.processes import counting_bar
+from kitting_drake.common.provenance import commit, versions
+from kitting_drake.episode.chosen import build_chosen, run_chosen
+from kitting_drake.evaluation.intervals import proportion_interval
+from kitting_drake.evaluation.quantities import numbers_table
+from kitting_drake.evaluation.summary import counted_objects, peak_forces
+from kitting_drake.hkd.fabrication.export import export_kit
+from kitting_drake.hkd.fabrication.kit_request import FITS, KitRequest
+from kitting_drake.hkd.importing.importer import ImportRequest, import_tool
+from kitting_drake.hkd.tools.tool import load_tool
+from kitting_drake.hkd.tracing.tracer import TraceRequest, trace
+from kitting_drake.reproduction.benchmarks.trace_benchmark import TOOLS, drawn_case
+from kitting_drake.reproduction.benchmarks.trace_photos import draw_photo
+from kitting_drake.scenario.choosing import find_scenario
+
+_PHOTOS = 4
+"""A photo whose outline is in doubt is taken again, at most this often in all."""
+_TOOLS = 4
+_LINES = "kits.jsonl"
+
+
+def measure_traced_kits(
+    kits: int, seed: int, fit: str, folder: Path, console: Console
+) -> dict[str, Any]:
+    """Makes kits of four tools from traced photos, and lets the oracle fill them with the true
+    tools, with one try for each. Skips the kits that are in the folder already.
+
+    The photos are drawn as for `benchmark trace`, with each tool's own height. A photo in doubt is
+    taken again, as `hkd trace` asks.
+
+    Args:
+        kits: the number of kits.
+        seed: the seed of photos and scenes.
+        fit: the kits' clearance, a key of `FITS`.
+        folder: the folder of `kits.jsonl`, photos and kits.
+        console: the console for the progress.
+
+    Raises:
+        UserError: the folder holds other files, or the kits of another version.
+    """
+    identity = {"seed": seed, "fit": fit, "versions": versions()}
+    claim_folder(folder, "kits_of.json", identity, of="seed, fit or version")
+    done = {line["kit"]: line for line in read_lines(folder / _LINES)}
+    with counting_bar(console, "kits") as progress:
+        bar = progress.add_task("", total=kits)
+        for number in range(kits):
+            if number not in done:
+                done[number] = _measure(number, seed, FITS[fit], folder / f"kit_{number}")
+                append_line(folder / _LINES, done[number])
+            progress.advance(bar)
+    return {**identity, "commit": commit(), **_summary([done[number] for number in range(kits)])}
+
+
+def _measure(number: int, seed: int, clearance_mm: float, folder: Path) -> dict[str, Any]:
+    """Makes one kit and fills it."""
+    photos: list[dict[str, Any]] = []
+    names = _names(number, seed)
+    cavities = [
+        str(_traced(name, _TOOLS * number + slot, seed, folder / name, photos).resolve())
+        for slot, name in enumerate(names)
+    ]
+    export_kit(KitRequest(tuple(cavities), folder / "kit", clearance_mm=clearance_mm))
+    task = json.dumps({"tools": names, "cavities": cavities, "tries": 1})
+    chosen = find_scenario(
+        folder / "kit" / "scenario.yaml", text=f"{{task: {task}, policy: !Oracle {{}}}}"
+    )
+    result = run_chosen(chosen, *build_chosen(chosen, seed=seed + number))
+    if result.interrupted:
+        raise KeyboardInterrupt
+    return {"kit": number, "photos": photos, "episode": result.as_dict()}
+
+
+def _names(number: int, seed: int) -> list[str]:
+    """The tools of a kit. All tools are used once before one is used again."""
+    round_, place = divmod(_TOOLS * number, len(TOOLS))
+    mixed = np.random.default_rng([seed, round_]).permutation(len(TOOLS))
+    return [TOOLS[index] for index in mixed[place : place + _TOOLS]]
+
+
+def _traced(name: str, index: int, seed: int, folder: Path, photos: list[dict[str, Any]]) -> Path:
+    """Traces a tool, and returns the folder of the traced tool. Appends its photos to `photos`."""
+    true = load_tool(name)
+    report = None
+    for attempt in range(_PHOTOS):
+        spec, drawn = drawn_case(name, _PHOTOS * index + attempt, attempt % 3, True, seed)
+        drawn = dataclasses.replace(drawn, height=1e3 * true.height)
+        place = folder / f"photo_{attempt}"
+        place.mkdir(parents=True, exist_ok=True)
+        (place / "photo.jpg").write_bytes(draw_photo([drawn], spec))
+        entry: dict[str, Any] = {"tool": name, "tilt_deg": spec.tilt, "ground": spec.ground}
+        photos.append(entry)
+        request = TraceRequest(place / "photo.jpg", place, heights_mm=(drawn.height,), name=name)
+        try:
+            report = trace(request)
+        except UserError as error:
+            entry["refused"] = str(error)
+            continue
+        entry["doubts"] = sum(len(tool.doubts) for tool in report.tools)
+        if not entry["doubts"]:
+            break
+    if report is None:
+        raise UserError(f"no photo of {name} can be traced: {photos[-1]['refused']}")
+    traced = max(report.tools, key=lambda tool: tool.outline.area())
+    return import_tool(
+        ImportRequest(
+            mesh=traced.svg,
+            category=true.category,
+            name=f"traced_{name}",
+            output=folder / "tools",
+            height_mm=traced.height_mm,
+        )
+    ).directory
+
+
+def _summary(lines: list[dict[str, Any]]) -> dict[str, Any]:
+    episodes = [line["episode"] for line in lines]
+    objects = [item for items in counted_objects(episodes) for item in items]
+    strict = sum(item["strict_success"] for item in objects)
+    photos = [photo for line in lines for photo in line["photos"]]
+    forces = [peak["force"] for peak in peak_forces(episodes)]
+    return {
+        "kits": len(lines),
+        "tools": len(objects),
+        "strict": strict,
+        "interval": proportion_interval(strict, len(objects)),
+        "failed": {
+            item["name"]: item["cause"] or "wrong height or heading"
+            for item in objects
+            if not item["strict_success"]
+        },
+        "photos": len(photos),
+        "photos_in_doubt": sum(bool(photo.get("doubts")) for photo in photos),
+        "photos_refused": sum("refused" in photo for photo in photos),
+        "peak_force_n": max(forces, default=None),
+    }
+
+
+def traced_kits_table(measured: dict[str, Any]) -> Table:
+    """Makes a table of the measurements."""
+    table = numbers_table(f"{measured['kits']} traced kits, fit: {measured['fit']}", "", "measured")
+    low, high = measured["interval"]
+    table.add_row("strict successes", f"{measured['strict']} of {measured['tools']}")
+    table.add_row("95 % interval, %", f"{100 * low:.0f} to {100 * high:.0f}")
+    table.add_row(
+        "photos; in doubt, refused",
+        f"{measured['photos']}; {measured['photos_in_doubt']}, {measured['photos_refused']}",
+    )
+    if measured["peak_force_n"] is not None:
+        table.add_row("largest force, N", f"{measured['peak_force_n']:.0f}")
+    for name, cause in measured["failed"].items():
+        table.add_row(f"failed: {name}", cause)
+    return table
