@@ -40,6 +40,7 @@ from kitting_drake.hkd.fabrication.foam_sheet import (
 from kitting_drake.hkd.fabrication.kit_request import (
     KitRequest,
     check_request,
+    error_notes,
     kit_parameters,
 )
 from kitting_drake.hkd.fabrication.labels import DEPTH
@@ -130,6 +131,7 @@ def _made(request: KitRequest, kit: Kit, others: Sequence[SheetKit]) -> KitFiles
     block = solid(design)
     notes = [
         *design.notes,
+        *error_notes(request, kit.tools),
         *wall_notes(design, 1e-3 * request.nozzle_mm),
         *undercut_notes(block, design),
     ]

@@ -179,7 +179,31 @@ def _clearance_of(request: KitRequest, loaded: Mapping[str, Tool]) -> dict[str, 
         if not 0.0 <= value <= _WIDEST_MM:
             raise UserError(f"--fit_of {name}={value:g} is out of range: give 0 to {_WIDEST_MM:g}")
         clearances[tool.name] = round(1e-3 * value, 7)
+    for tool in loaded.values():
+        if tool.outline_error and tool.name not in clearances:
+            clearances[tool.name] = _widened(request, tool)
     return clearances
+
+
+def _widened(request: KitRequest, tool: Tool) -> float:
+    """The clearance of a tool whose outline is uncertain, in metres: wider by its error, but not
+    beyond the template's clearance for this reason."""
+    default = KitParameters().clearance
+    asked = default if request.clearance_mm is None else 1e-3 * request.clearance_mm
+    return round(max(asked, min(asked + tool.outline_error, default)), 7)
+
+
+def error_notes(request: KitRequest, tools: Sequence[Tool]) -> list[str]:
+    """A sentence for each tool whose cavity is wider because its outline is uncertain."""
+    given = {name for name, _ in request.fit_of}
+    notes = {
+        tool.name: f"the cavity of '{tool.name}' has {1e3 * _widened(request, tool):g} mm on each "
+        f"side, because its outline may be off by {1e3 * tool.outline_error:g} mm: "
+        f"--fit_of {tool.name}=FIT sets another clearance"
+        for name, tool in zip(request.tools, tools, strict=True)
+        if tool.outline_error and not given & {name, tool.name}
+    }
+    return list(notes.values())
 
 
 def _on_grid(tools: Sequence[Tool], parameters: KitParameters) -> KitParameters:

@@ -45,6 +45,8 @@ class ImportRequest:
     frame: str | None = None
     """Whether a rectangle around all other curves of a drawing is the page or the tool: one of
     `closed_curves.FRAMES`. None: the user is asked if this is not clear."""
+    outline_error_mm: float = 0.0
+    """See `Tool.outline_error`."""
 
     @property
     def given_density(self) -> float | None:

@@ -232,6 +232,7 @@ def _write(
     say("measuring its symmetry")
     record = {
         **_properties(tool, mass, center, symmetry_order(1e-3 * vertices[faces])),
+        **({"outline_error": 1e-3 * error} if (error := request.outline_error_mm) else {}),
         "imported": {
             "file": request.mesh.name,
             "sha256": digest_of(request.mesh),

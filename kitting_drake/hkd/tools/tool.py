@@ -61,6 +61,9 @@ class Tool:
     """The factor by which the meshes in the visual files are scaled."""
     other_grasps: tuple[Grasp, ...] = ()
     """More grasps, best first, to try after the annotated grasp has failed."""
+    outline_error: float = 0.0
+    """How far the real tool may extend beyond its outline, in metres, for instance because it was
+    traced from a photo."""
 
     @property
     def grasps(self) -> tuple[Grasp, ...]:
@@ -197,6 +200,7 @@ def load_tool(name: str, base: Path | None = None) -> Tool:
             visual_meshes=tuple(directory / str(path) for path in record["visual_meshes"]),
             symmetry=int(record.get("symmetry", 1)),
             other_grasps=tuple(map(_read_grasp, record.get("other_grasps", ()))),
+            outline_error=float(record.get("outline_error", 0.0)),
         )
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
@@ -224,6 +228,8 @@ def load_tool(name: str, base: Path | None = None) -> Tool:
             raise UserError(f"{record_path}: {name} is {value:g}; it must be positive")
     if not np.isfinite([dataclasses.astuple(grasp) for grasp in tool.grasps]).all():
         raise UserError(f"{record_path}: grasp must consist of finite numbers")
+    if not 0 <= tool.outline_error < math.inf:
+        raise UserError(f"{record_path}: outline_error must not be negative")
     if tool.symmetry < 1:
         raise UserError(f"{record_path}: symmetry is {tool.symmetry}; it must be 1 or more")
     return _shared(tool, tuple(path.stat().st_mtime_ns for path in tool.visual_meshes))

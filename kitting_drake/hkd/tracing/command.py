@@ -12,8 +12,13 @@ from kitting_drake.common.errors import UserError
 from kitting_drake.hkd.listing import size_text
 
 if TYPE_CHECKING:
+    from kitting_drake.hkd.importing.importer import ImportReport
     from kitting_drake.hkd.tracing.scales import Scale
     from kitting_drake.hkd.tracing.tracer import TracedTool
+
+_OUTLINE_ERROR_MM = 0.5
+"""How far tools extend beyond outlines without a doubt, at most places. Cavities are wider by
+this."""
 
 
 def describe_trace(tracer: argparse.ArgumentParser) -> None:
@@ -124,8 +129,7 @@ def trace_photo(args: argparse.Namespace) -> None:
     Raises:
         UserError: the arguments or the photo cannot be used.
     """
-    # Import lazily: OpenCV and the importer are slow to import.
-    from kitting_drake.hkd.importing.importer import ImportRequest, import_tool
+    # Import lazily, because OpenCV is slow to import.
     from kitting_drake.hkd.tracing.tracer import TraceRequest, trace
 
     if args.category and not args.height_mm:
@@ -160,20 +164,33 @@ def trace_photo(args: argparse.Namespace) -> None:
     made = []
     for tool, category in zip(report.tools, categories, strict=True):
         with Console(stderr=True, quiet=args.quiet).status(f"importing {tool.name}"):
-            imported = import_tool(
-                ImportRequest(
-                    mesh=tool.svg,
-                    category=category,
-                    name=tool.name,
-                    output=args.output / "tools",
-                    height_mm=tool.height_mm,
-                )
-            )
+            imported = import_traced(tool, category, tool.name, args.output / "tools")
         record = imported.record
         console.print(f"{tool.name}: {size_text(record)} mm, {1e3 * record['mass']:.0f} g")
         made.append(shlex.quote(str(imported.directory)))
     console.print(
         f"next: python -m kitting_drake.hkd kit {' '.join(made)} --output DIR", soft_wrap=True
+    )
+
+
+def import_traced(tool: "TracedTool", category: str, name: str, folder: Path) -> "ImportReport":
+    """Makes a tool from a traced outline, in a folder of tools.
+
+    Raises:
+        UserError: the tool cannot be made.
+    """
+    # Import lazily, because the importer is slow to import.
+    from kitting_drake.hkd.importing.importer import ImportRequest, import_tool
+
+    return import_tool(
+        ImportRequest(
+            mesh=tool.svg,
+            category=category,
+            name=name,
+            output=folder,
+            height_mm=tool.height_mm,
+            outline_error_mm=_OUTLINE_ERROR_MM,
+        )
     )
 
 

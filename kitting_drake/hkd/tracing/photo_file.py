@@ -65,7 +65,7 @@ def read_photo(path: Path) -> Photo:
                 inner = dict(opened.getexif().get_ifd(ExifTags.IFD.Exif))
                 upright = ImageOps.exif_transpose(opened)
                 stored = (opened.width, opened.height)
-                pixels = np.asarray(upright.convert("RGB"))
+                pixels = np.asarray(_rgb(upright))
     except UserError:
         raise
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
@@ -86,6 +86,17 @@ def read_photo(path: Path) -> Photo:
     if taken[0] and taken[1]:
         cropped = abs(math.log(taken[0] / taken[1] * stored[1] / stored[0])) > 0.01
     return Photo(path, pixels, focal if focal and 5 <= focal <= 400 else None, cropped)
+
+
+def _rgb(picture: Image.Image) -> Image.Image:
+    """Converts a picture to RGB with 8 bits; what is transparent becomes white."""
+    if picture.mode.startswith("I"):
+        # Pillow would clip gray values of 16 bits instead of scaling them.
+        picture = Image.fromarray((np.asarray(picture) >> 8).clip(0, 255).astype(np.uint8))
+    if picture.has_transparency_data:
+        clear = picture.convert("RGBA")
+        picture = Image.alpha_composite(Image.new("RGBA", clear.size, "white"), clear)
+    return picture.convert("RGB")
 
 
 def _number(value: Any) -> float | None:

@@ -20,8 +20,8 @@ from kitting_drake.evaluation.quantities import numbers_table
 from kitting_drake.evaluation.summary import counted_objects, peak_forces
 from kitting_drake.hkd.fabrication.export import export_kit
 from kitting_drake.hkd.fabrication.kit_request import FITS, KitRequest
-from kitting_drake.hkd.importing.importer import ImportRequest, import_tool
 from kitting_drake.hkd.tools.tool import load_tool
+from kitting_drake.hkd.tracing.command import import_traced
 from kitting_drake.hkd.tracing.tracer import TraceRequest, trace
 from kitting_drake.reproduction.benchmarks.trace_benchmark import TOOLS, drawn_case
 from kitting_drake.reproduction.benchmarks.trace_photos import draw_photo
@@ -115,15 +115,7 @@ def _traced(name: str, index: int, seed: int, folder: Path, photos: list[dict[st
     if report is None:
         raise UserError(f"no photo of {name} can be traced: {photos[-1]['refused']}")
     traced = max(report.tools, key=lambda tool: tool.outline.area())
-    return import_tool(
-        ImportRequest(
-            mesh=traced.svg,
-            category=true.category,
-            name=f"traced_{name}",
-            output=folder / "tools",
-            height_mm=traced.height_mm,
-        )
-    ).directory
+    return import_traced(traced, true.category, f"traced_{name}", folder / "tools").directory
 
 
 def _summary(lines: list[dict[str, Any]]) -> dict[str, Any]:

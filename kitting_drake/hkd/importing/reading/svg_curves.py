@@ -70,7 +70,10 @@ def svg_curves(path: Path, unit_mm: float | None = None) -> DrawnCurves:
     except Exception as error:
         # The reader raises many types of errors on broken files.
         raise UserError(f"{path} cannot be read as SVG: export it again") from error
-    return DrawnCurves(curves, measured, page)
+    notes = []
+    if any(e.get(name) for e in root.iter() for name in ("clip-path", "mask")):
+        notes.append("clipping and masks are ignored: curves count as a whole")
+    return DrawnCurves(curves, measured, page, notes)
 
 
 def _filling(shape: Any, number: int) -> tuple[bool, int | None]:

@@ -1,5 +1,6 @@
 """The outside of the block, fits of single tools, depths, and walls that cannot be printed."""
 
+import dataclasses
 import re
 import subprocess
 from collections.abc import Callable
@@ -13,7 +14,7 @@ from manifold3d import CrossSection, Manifold, Mesh64
 from kitting_drake.common.errors import UserError
 from kitting_drake.hkd.fabrication.design import Design, design_kit
 from kitting_drake.hkd.fabrication.export import export_kit
-from kitting_drake.hkd.fabrication.kit_request import KitRequest
+from kitting_drake.hkd.fabrication.kit_request import KitRequest, error_notes, kit_parameters
 from kitting_drake.hkd.fabrication.outside import FOOT, FOOT_HEIGHT, GAP, PITCH, grid_side
 from kitting_drake.hkd.fabrication.thin_walls import undercut_notes, wall_notes
 from kitting_drake.hkd.generation.part_models import load_named
@@ -197,3 +198,17 @@ def test_cavities_by_name_keep_the_default_elsewhere():
         kit_cavities(tools, plain, poses), kit_cavities(tools, named, poses), strict=True
     ):
         assert one.outline.area() == other.outline.area()
+
+
+@pytest.mark.parametrize(
+    ("asked", "fit_of", "expected"),
+    [(0.35, (), 0.85), (1.8, (), 2.0), (3.0, (), 3.0), (0.35, ((ROD, 0.15),), 0.15)],
+)
+def test_a_traced_tool_gets_room_for_the_error_of_its_outline(
+    asked: float, fit_of: tuple, expected: float, tmp_path: Path
+):
+    tool = dataclasses.replace(load_named(ROD), outline_error=0.0005)
+    request = KitRequest((ROD,), tmp_path, clearance_mm=asked, fit_of=fit_of)
+    parameters = kit_parameters(request, {ROD: tool})
+    assert parameters.clearance_of[ROD] == pytest.approx(1e-3 * expected)
+    assert bool(error_notes(request, [tool])) == (not fit_of)

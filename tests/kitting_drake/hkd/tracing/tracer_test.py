@@ -5,10 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from manifold3d import CrossSection
+from PIL import ExifTags, Image
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.hkd.importing.outline import read_drawing
-from kitting_drake.hkd.tracing.photo_file import Photo
+from kitting_drake.hkd.tracing.photo_file import Photo, read_photo
 from kitting_drake.hkd.tracing.scales import Scale, plane_of_scale
 from kitting_drake.hkd.tracing.tracer import TraceReport, TraceRequest, trace
 from kitting_drake.reproduction.benchmarks.trace_benchmark import outline_errors
@@ -130,6 +131,26 @@ def test_an_empty_sheet_and_files_that_are_no_photos_are_refused(tmp_path: Path)
         traced(tmp_path / "text.jpg")
     with pytest.raises(UserError, match="there is no file"):
         traced(tmp_path / "missing.jpg")
+
+
+def test_photos_of_other_kinds_are_read_as_seen(tmp_path: Path):
+    shades = np.zeros((600, 800), np.uint16)
+    shades[:, 400:] = 40_000
+    Image.fromarray(shades).save(tmp_path / "deep.png")
+    deep = read_photo(tmp_path / "deep.png").pixels
+    assert (deep[0, 0, 0], deep[0, 700, 0]) == (0, 156)
+    clear = np.zeros((600, 800, 4), np.uint8)
+    clear[:, 400:, 3] = 255
+    Image.fromarray(clear).save(tmp_path / "clear.png")
+    cut_out = read_photo(tmp_path / "clear.png").pixels
+    assert (cut_out[0, 0, 0], cut_out[0, 700, 0]) == (255, 0)
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 6
+    Image.fromarray(clear[..., :3]).save(tmp_path / "turned.jpg", exif=exif)
+    assert read_photo(tmp_path / "turned.jpg").size == (600, 800)
+    (tmp_path / "phone.heic").write_bytes(b"\0\0\0\x18ftypheic" + bytes(200))
+    with pytest.raises(UserError, match="convert a HEIC first"):
+        read_photo(tmp_path / "phone.heic")
 
 
 def test_points_correct_the_outline(tmp_path: Path):

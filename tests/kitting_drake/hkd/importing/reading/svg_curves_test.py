@@ -145,6 +145,14 @@ def test_filled_paths_are_closed_and_thick_lines_are_not_holes(tmp_path: Path):
     assert "thick line" in drawing.notes[0]
 
 
+def test_what_is_clipped_counts_and_is_said(tmp_path: Path):
+    clipped = '<clipPath id="c"><rect width="90" height="60"/></clipPath>'
+    path = tmp_path / "clipped.svg"
+    path.write_text(svg(f'{clipped}<g clip-path="url(#c)">{bar()}</g>', MM))
+    drawing = read_drawing(path)
+    assert any("clipping" in note for note in drawing.notes)
+
+
 def test_the_smallest_gap_is_told_with_its_place(tmp_path: Path):
     path = tmp_path / "tool.svg"
     lines = "M20 10 H180 V30 M180 30.3 V30.3 H20 V10"
