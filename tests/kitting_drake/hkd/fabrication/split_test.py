@@ -1,11 +1,8 @@
-import itertools
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
-import trimesh
-from manifold3d import CrossSection, JoinType, Manifold, Mesh64, OpType
+from manifold3d import CrossSection, Manifold
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.hkd.fabrication.export import export_kit
@@ -16,9 +13,9 @@ from kitting_drake.hkd.fabrication.splitting.opening import (
     Opening,
     corner_area,
     thin_parts,
-    united,
 )
 from kitting_drake.hkd.fabrication.splitting.pieces import Split, fits, split_block
+from tests.kitting_drake.hkd.fabrication.rebuilding import assembled, assert_rebuilds
 
 HEIGHT = 40.0
 PLAY = 0.1
@@ -46,22 +43,6 @@ def split(
         assert fits(tuple(piece.size[:2]), bed)
         assert len(piece.body.decompose()) == 1
     return whole, found
-
-
-def assert_rebuilds(whole: Manifold, parts: list[Manifold], found: Split) -> None:
-    """Pieces agree with the whole outside the joints: in volume, and in sections by 0.05 mm."""
-    zone = united(j.outline.offset(found.play + 0.05, JoinType.Miter) for j in found.joints)
-    height = whole.bounding_box()[5]
-    joints = Manifold.extrude(zone, height + 2).translate((0, 0, -1))
-    joined = Manifold.batch_boolean(parts, OpType.Add)
-    difference = ((whole - joined) - joints).volume() + ((joined - whole) - joints).volume()
-    assert difference < 1e-5 * whole.volume()
-    for one, other in itertools.combinations(parts, 2):
-        assert (one ^ other).volume() < 0.5
-    for z in np.arange(0.53, height, 3.7):
-        section = united(part.slice(z) for part in parts)
-        wrong = ((whole.slice(z) - section) + (section - whole.slice(z))) - zone
-        assert wrong.offset(-0.025, JoinType.Miter).area() < 1e-9
 
 
 def thin(shape: CrossSection) -> list[CrossSection]:
@@ -150,16 +131,10 @@ def test_the_files_of_the_pieces(tmp_path: Path):
     )
     record = json.loads((tmp_path / "kit" / "kit.json").read_text())
     assert made.split is not None
-    parts = []
-    for number, piece in enumerate(record["pieces"], 1):
-        assert piece["file"] == f"piece_{number}.stl"
-        mesh = trimesh.load_mesh(tmp_path / "kit" / piece["file"])
-        assert mesh.is_watertight
-        np.testing.assert_allclose(mesh.bounds, [[0, 0, 0], piece["size"]], atol=1e-3)
-        assert sorted(piece["size"][:2]) <= [90.0, 100.0]
-        solid = Manifold(Mesh64(np.array(mesh.vertices), mesh.faces.astype(np.uint64)))
-        parts.append(solid.translate(tuple(piece["position"])))
-        assert (tmp_path / "kit" / f"piece_{number}.3mf").is_file()
+    parts = assembled(tmp_path / "kit")
     assert len(parts) > 1
+    for number, piece in enumerate(record["pieces"], 1):
+        assert sorted(piece["size"][:2]) <= [90.0, 100.0]
+        assert (tmp_path / "kit" / f"piece_{number}.3mf").is_file()
     assert (tmp_path / "kit" / "pieces.png").is_file()
     assert_rebuilds(made.block, parts, made.split)
