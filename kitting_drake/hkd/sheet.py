@@ -1,11 +1,13 @@
 """Renders contact sheets of tools and kits with Drake's VTK engine, without a display."""
 
+import hashlib
 import io
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 from pydrake.geometry import (
     Box,
     ClippingRange,
@@ -25,12 +27,18 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.sensors import CameraInfo
 
+from kitting_drake.common.cached_folder import cached_folder
 from kitting_drake.common.files import write_atomically
+from kitting_drake.common.paths import cache_directory
+from kitting_drake.common.provenance import versions
 from kitting_drake.common.rendering import require_rendering
 from kitting_drake.hkd.kits.kit import Kit
 from kitting_drake.hkd.kits.parameters import KitParameters
 from kitting_drake.hkd.tools.tool import Tool
 
+_FORMAT_VERSION = "1"
+"""The version of the pictures in the cache. Increase it when equal subjects give other pictures."""
+_PICTURE = "picture.png"
 _BACKGROUND = (0.97, 0.97, 0.96)
 # A key light casts the shadows. The fill light is at the camera, where its shadows are hidden.
 _LIGHTS = [
@@ -148,6 +156,24 @@ def render_subject(
     return image.data[:, :, :3].copy()
 
 
+def _kept_picture(subject: Subject) -> np.ndarray:
+    """Returns the picture of a subject from the cache, or renders it."""
+    digest = hashlib.sha256(f"{_FORMAT_VERSION} {versions()}".encode())
+    digest.update(f"{subject.target} {subject.size} {subject.elevation_deg}".encode())
+    for path, X_WB in subject.models:
+        digest.update(X_WB.GetAsMatrix4().tobytes())
+        for file in sorted(path.parent.iterdir()):
+            if file.is_file():
+                digest.update(file.read_bytes())
+    folder = cached_folder(
+        cache_directory() / "pictures" / digest.hexdigest()[:24],
+        [_PICTURE],
+        lambda made: Image.fromarray(render_subject(subject)).save(made / _PICTURE),
+    )
+    with Image.open(folder / _PICTURE) as picture:
+        return np.asarray(picture)
+
+
 def _add_table(scene_graph: SceneGraph) -> None:
     source = scene_graph.RegisterSource("table")
     table = GeometryInstance(RigidTransform([0.0, 0.0, -0.01]), Box(4.0, 4.0, 0.02), "table")
@@ -159,6 +185,9 @@ def _add_table(scene_graph: SceneGraph) -> None:
 
 def write_sheet(subjects: Iterable[Subject], count: int, output: Path) -> None:
     """Writes one picture of all the subjects with their titles.
+
+    The picture of each subject is kept in the cache, so a sheet that was interrupted continues
+    where it stopped.
 
     Args:
         subjects: the contents of the pictures.
@@ -183,7 +212,7 @@ def write_sheet(subjects: Iterable[Subject], count: int, output: Path) -> None:
     for axis in axes.flat:
         axis.set_axis_off()
     for axis, subject in zip(axes.flat, subjects, strict=False):
-        axis.imshow(render_subject(subject))
+        axis.imshow(_kept_picture(subject))
         axis.set_title(subject.title, fontsize=13, color="0.15")
     figure.tight_layout()
     picture = io.BytesIO()
