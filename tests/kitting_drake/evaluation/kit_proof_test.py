@@ -6,8 +6,11 @@ from pathlib import Path
 
 import pytest
 
+from kitting_drake.common.errors import UserError
 from kitting_drake.evaluation.kit_proof import KitProof, ToolProof, _verdict, prove_kit
 from kitting_drake.hkd.fabrication.export import KitRequest, export_kit
+from kitting_drake.hkd.proving import tools_to_prove
+from kitting_drake.hkd.tools.tool import load_tool
 
 
 def proof(clearance_mm: float, *kitted: int, cause: str = "insertion blocked") -> KitProof:
@@ -49,3 +52,21 @@ def test_a_kit_is_proved_and_can_be_made_again(tmp_path: Path):
     assert json.loads((tmp_path / "kit" / "proof.json").read_text())["verdict"] == verdict
     export_kit(request)
     assert not (tmp_path / "kit" / "proof.html").exists()
+
+
+def test_true_tools_are_named_for_the_tools_of_the_kit():
+    tools = ("rod_80x14", "plate_90x40x8")
+    assert tools_to_prove(tools, ()) == []
+    rod, plate = tools_to_prove(tools, (("rod_80x14", "rod_81x14"),))
+    assert load_tool(rod).name == "rod_81x14"
+    assert load_tool(plate).name == "plate_90x40x8"
+    with pytest.raises(UserError, match="'bar' is not a tool of this kit: it has rod_80x14, plate"):
+        tools_to_prove(tools, (("bar", "rod_81x14"),))
+
+
+def test_a_kit_is_given_up_only_when_it_certainly_does_not_fit():
+    clear = KitProof(0.15, {"rod": ToolProof("rod", 1, 4)})
+    assert clear.is_hopeless
+    few = KitProof(0.15, {"rod": ToolProof("rod", 0, 1)})
+    many = KitProof(0.15, {"rod": ToolProof("rod", 37, 40)})
+    assert not few.is_hopeless and not many.is_hopeless
