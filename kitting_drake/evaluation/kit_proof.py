@@ -279,7 +279,7 @@ def _run_episode(folder: Path, seed: int, text: str) -> _Outcome:
     if pictured:
         add_picture_renderer(station.scene_graph)
     result = run_chosen(chosen, diagram, station, observers=[observe] if pictured else [])
-    tools = {}
+    tools: dict[str, ToolProof] = {}
     for item in result.objects:
         tool = tools.setdefault(item.name, ToolProof(item.name, int(item.strict_success), 1))
         if not item.strict_success:
