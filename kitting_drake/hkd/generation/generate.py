@@ -108,7 +108,7 @@ def build_parts(entry: ToolEntry) -> list[Part]:
 
 
 def homogeneous(parts: list[Part]) -> list[Body]:
-    """Returns the parts of a tool with their densities."""
+    """Returns the solids of a tool's parts with their densities, for `mass_properties`."""
     return [(part.solid, MATERIALS[part.material].density) for part in parts]
 
 

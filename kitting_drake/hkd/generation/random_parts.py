@@ -1,6 +1,7 @@
 """Random solids for training: flat outlines, rings, plates, discs, rods and bolts.
 
-They are drawn besides the random tools, so that networks see more than hand tools.
+They are a share of the random tools (`random_tools`), so that networks train on more than hand
+tools.
 """
 
 import math
@@ -45,7 +46,7 @@ def draw_solid(rng: np.random.Generator) -> Manifold:
 
 
 def _polygon(rng: np.random.Generator) -> CrossSection:
-    """Draws a regular polygon, or an irregular one with 3 to 9 corners."""
+    """Draws a regular or an irregular polygon with 3 to 9 corners."""
     count = int(rng.integers(3, 10))
     angles = np.arange(count) * math.tau / count
     radii = np.ones(count)

@@ -151,7 +151,7 @@ def _draw_length(rng: np.random.Generator) -> float:
 
 
 def _varied(entry: ToolEntry, rng: np.random.Generator) -> ToolEntry:
-    """Returns a design with random proportions. Those that the entry does not set vary as well."""
+    """Returns an entry with random proportions. Parameters that it does not set vary as well."""
     defaults = DESIGNS[entry.category][0]()
     parameters = {
         key: value for key, value in vars(defaults).items() if isinstance(value, float)
