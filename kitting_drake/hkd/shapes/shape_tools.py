@@ -46,14 +46,18 @@ _DENSITY = 1150.0
 _COLOURS = ("red_grip", "blue_grip", "yellow_grip", "green_grip", "orange_grip", "hickory")
 _LARGEST_MM = 250.0
 _TIPS_DEG = 10.0
-"""The tilt of the table, in degrees, at which a flat shape must not tip over."""
+"""A shape counts as flat if it does not tip over on a table with this tilt, in degrees."""
 _CREASE_DEG = 35.0
 # A solid counts as a prism if its volume differs from that of its extruded outline by less than
 # this share.
 _PRISM = 0.01
-# The tolerances of the collision hulls' outline, tried in turn until the hulls are few enough. Then
-# the tolerance of the shape's holes, and the tolerance for thinning vertices.
-_OUTLINES_MM, _HOLE_MM, _VERTEX_MM = (0.12, 0.2, 0.3), 0.8, 0.08
+_OUTLINES_MM = (0.12, 0.2, 0.3)
+"""The tolerances of the collision hulls' outline, tried in turn until there are at most
+`_MOST_HULLS` hulls."""
+_HOLE_MM = 0.8
+"""The tolerance of the outlines of holes in the collision hulls."""
+_VERTEX_MM = 0.08
+"""The tolerance for thinning the vertices of the hulls."""
 _MOST_HULLS = 12
 _BESIDE = 0.025
 """The distance of a grasp from the centre of mass, in metres, that adds 1 to its cost."""
