@@ -91,8 +91,8 @@ def focal_of_homography(homography: Array, center: Array) -> float | None:
     h = _centred(homography, center)
     h = h / np.linalg.norm(h)
     a, b = h[:, 0], h[:, 1]
-    # With w = 1/f^2, perpendicular axes require w (a1 b1 + a2 b2) = -a3 b3, and equal scales w
-    # (|a12|^2 - |b12|^2) = b3^2 - a3^2.
+    # Let w = 1 / f^2. Perpendicular axes require w (a1 b1 + a2 b2) = -a3 b3. Equal scales require
+    # w (a1^2 + a2^2 - b1^2 - b2^2) = b3^2 - a3^2.
     left = np.array([a[:2] @ b[:2], (a[:2] @ a[:2] - b[:2] @ b[:2]) / 2])
     right = np.array([-a[2] * b[2], (b[2] ** 2 - a[2] ** 2) / 2])
     w = float(left @ right) / max(float(left @ left), 1e-30)
@@ -120,7 +120,7 @@ def focal_of_height(homography: Array, height: float, start_px: float, center: A
 
 
 def aspect_of_quad(corners: Array, focal_px: float, center: Array) -> float:
-    """Computes the ratio of the first side of a rectangle to the second.
+    """Computes the ratio of a rectangle's side from corner 0 to 1 to its side from corner 1 to 2.
 
     Args:
         corners: (4, 2) the rectangle's corners in pixels.

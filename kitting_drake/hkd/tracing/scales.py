@@ -21,7 +21,8 @@ Array = NDArray[np.float64]
 
 _COIN_MM = 2.0
 """The assumed height of a coin, in mm."""
-_ROUNDEST_TILT = math.radians(10)
+_MOST_TILT = math.radians(10)
+"""The largest tilt of a circle, in radians, at which it is still found as a disc."""
 _MARGIN_MM = 3.0
 _LEAST_CORNERS = 6
 _SMALL_SIDE = 1200
@@ -75,8 +76,9 @@ def plane_of_scale(cv2: Any, photo: Photo, scale: Scale, camera_mm: float | None
     distance = math.hypot(u2 - u1, v2 - v1)
     if distance < 20 or not 1 <= scale.length_mm <= 5000:
         raise UserError(
-            "--scale_px must be two points at least 20 pixels apart, and --scale_mm must be their "
-            "distance, 1 to 5000 mm"
+            f"the points of --scale_px are {distance:.0f} pixels apart, and --scale_mm is "
+            f"{scale.length_mm:g}: give two points at least 20 pixels apart, and their distance, 1 "
+            "to 5000 mm"
         )
     px_per_mm = distance / scale.length_mm
     focal, told = _focal(photo, px_per_mm, camera_mm)
@@ -147,8 +149,8 @@ def _find_disc(cv2: Any, photo: Photo) -> tuple[Array, float]:
 
 
 def _disc_of(cv2: Any, contour: Any) -> tuple[float, Array, float] | None:
-    """Fits a circle to a contour; returns its (misfit, centre, radius), or None if it is no
-    circle."""
+    """Fits a circle to a contour; returns its (misfit, centre, radius), or None if the contour is
+    not a circle."""
     area = cv2.contourArea(contour)
     if len(contour) < 40 or area < 400:
         return None
@@ -156,7 +158,7 @@ def _disc_of(cv2: Any, contour: Any) -> tuple[float, Array, float] | None:
     ratio = min(axes) / max(axes)
     misfit = abs(area / (math.pi * axes[0] * axes[1] / 4) - 1)
     hull = cv2.contourArea(cv2.convexHull(contour))
-    if ratio < math.cos(_ROUNDEST_TILT) or misfit > 0.03 or hull > 1.03 * area:
+    if ratio < math.cos(_MOST_TILT) or misfit > 0.03 or hull > 1.03 * area:
         return None
     return misfit + 1 - ratio, np.array(center), float(axes[0] + axes[1]) / 4
 

@@ -108,7 +108,10 @@ def _quads_of(cv2: Any, mask: Any) -> Iterator[Array]:
 
 
 def _four_sides(cv2: Any, hull: Any) -> Array | None:
-    """Returns the corners (4, 2) where the four longest sides of a convex hull meet, or None."""
+    """Returns the corners (4, 2) where the lines of the four longest sides of a convex hull meet.
+
+    Returns None if these corners do not form a convex quadrilateral close to the hull.
+    """
     length = cv2.arcLength(hull, True)
     polygon = cv2.approxPolyDP(hull, 0.008 * length, True)[:, 0].astype(float)
     if len(polygon) < 4:

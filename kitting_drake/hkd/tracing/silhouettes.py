@@ -16,13 +16,12 @@ from kitting_drake.hkd.tracing.tool_mask import BOLD, ToolMasks, look_for
 Array = NDArray[Any]
 
 _RIM_MM = 1.2
-"""The width of the rim of a sheet that is ignored, because the sheet's edge casts a shadow there,
-in mm."""
+"""The width, in mm, of the rim of a sheet that is ignored because the edge casts a shadow there."""
 _LEAST_LOOP_MM2 = 4.0
 _LEAST_TOOL_MM2 = 60.0
 _FLAT_MM = 0.03
 _EDGE_SLACK_MM = 0.4
-"""Half the width, in mm, up to which a strip in which two masks differ is ignored."""
+"""Strips in which two masks differ are ignored if they are narrower than twice this, in mm."""
 _BORDER_SLACK_MM = 3.3
 """The width in mm of the strip in which a border lies that blends into a shadow."""
 _STRETCH_GAP_MM = 2.0

@@ -17,12 +17,12 @@ def outline_of_silhouette(
 ) -> CrossSection:
     """Computes a tool's outline from its silhouette, both in mm in the plane's frame.
 
-    Let the camera be at height H above the plane, and the tool t high. A point at height h appears
-    H / (H - h) times as far from the point below the camera. Where an upright side faces away from
-    that point, the camera sees the side's top. Where the side faces that point, the camera sees its
-    foot. So the outline is the part of the plane that the silhouette covers at every scale from 1
-    to (H - t) / H. The widest points of a round tool are at height t / 2 on all sides, so its
-    silhouette is scaled only once.
+    Let H be the camera's height above the plane, and t the tool's height. In the photo, the
+    distance of a point at height h from the point below the camera is H / (H - h) times too large.
+    Where an upright side faces away from the camera, the silhouette ends at the side's top edge;
+    where it faces the camera, at the side's bottom edge. So the outline is the part of the plane
+    that the silhouette covers at every scale from 1 to (H - t) / H. The widest points of a round
+    tool are at height t / 2 on all sides, so its silhouette is scaled only once.
 
     Args:
         silhouette: the area that the tool hides in the plane.

@@ -95,7 +95,7 @@ class ToolMasks:
     def __init__(
         self, cv2: Any, ratio: Array, ground: Array, spread: float, px_per_mm: float
     ) -> None:
-        """Measures the photo.
+        """Measures lightness, colour, roughness and steps of light in the photo.
 
         Args:
             cv2: OpenCV.
@@ -248,7 +248,7 @@ def _median(values: Array, otherwise: float) -> float:
 
 
 def _lightness_and_colour(cv2: Any, logs: Array) -> tuple[Array, Array]:
-    """Returns the mean of the three logarithms, and the largest deviation of one from the mean."""
+    """Returns the mean of each pixel's three logarithms, and their largest deviation from it."""
     lightness = cv2.transform(logs, np.full((1, 3), 1 / 3, np.float32))
     colour = np.zeros_like(lightness)
     for k in range(3):

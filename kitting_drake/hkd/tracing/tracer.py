@@ -143,7 +143,10 @@ def trace(request: TraceRequest) -> TraceReport:
 def _checked(request: TraceRequest) -> str:
     name = request.name or re.sub(r"[^a-z0-9]+", "_", request.photo.stem.lower()).strip("_")[:50]
     if not re.fullmatch(r"[a-z0-9][a-z0-9_]{0,60}", name):
-        raise UserError("--name must consist of lower-case letters, digits and underscores")
+        raise UserError(
+            f"the name '{name}' cannot be used: give a --name of lower-case letters, digits and "
+            "underscores"
+        )
     for flag, values, (low, high) in (
         ("--height_mm", request.heights_mm, _HEIGHTS_MM),
         ("--camera_mm", (request.camera_mm,) if request.camera_mm else (), _CAMERAS_MM),
@@ -243,9 +246,9 @@ def _doubts(
 
 
 def _gap_between(part: CrossSection, other: CrossSection) -> Unclear | None:
-    """Returns the gap between two silhouettes that may belong to one tool, split by a reflection.
+    """Returns the gap between two silhouettes. A reflection may have split one tool into the two.
 
-    Returns None if they are too far apart.
+    Returns None if they are more than `_APART_MM` apart.
     """
     grown = _APART_MM / 2
     bridge = part.offset(grown, JoinType.Round) ^ other.offset(grown, JoinType.Round)
