@@ -165,7 +165,7 @@ def fill_sheet(
 def _merit(places: Sequence[KitPlace], kits: Sequence[SheetKit]) -> tuple[int, float]:
     """Returns the number of different kits on the sheet, and the area in mm^2 that kits cover.
 
-    The better of two packings has more different kits, or as many and more covered area.
+    The better of two packings has more different kits. If they have equally many, it covers more.
     """
     present = len({place.kit for place in places})
     return present, sum(math.prod(kits[place.kit].size) for place in places)
@@ -184,8 +184,8 @@ def _packings(
     if len(kits) == 1:
         count = min(len(order), int(room[0] * room[1] / areas[0]) + 1)
         order = order[:count]
-        # Turn the first copies or the last copies, for each number of turned copies. Then turn
-        # copies at random, because the densest packing may be a pinwheel.
+        # Try each number of turned copies, placed before or after the others. Then turn copies at
+        # random, because the densest packing may be a pinwheel.
         for first, number in itertools.product((False, True), range(count + 1)):
             patterns.append([first] * number + [not first] * (count - number))
         mixtures = np.random.default_rng(0).random((_MIXTURES, count)) < 0.5
