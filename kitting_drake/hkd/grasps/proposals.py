@@ -149,8 +149,8 @@ def _levels(height: float) -> Array:
 
 
 def _slices(triangles: Array, levels: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Returns points (n, 2) on the outlines of the horizontal slices, and the level (n) of each
-    point."""
+    """Returns points (n, 2) on the outlines of the horizontal slices, and the index (n) of each
+    point's slice."""
     all_points, all_levels = [np.empty((0, 2))], [np.empty(0, dtype=np.int64)]
     low, high = triangles[:, :, 2].min(axis=1), triangles[:, :, 2].max(axis=1)
     for index, z in enumerate(levels):
@@ -185,7 +185,7 @@ def _search(
 
     Args:
         points: (n, 2) points of the slices.
-        level: (n) the level of each point.
+        level: (n) the index of each point's slice.
         levels: the heights of the slices, in metres.
         com: (2,) the centre of mass in T, in metres.
         theta: the rotation of the hand, in radians.
