@@ -8,7 +8,7 @@ Array = NDArray[np.float64]
 
 # The difference in area (mm^2) up to which two outlines count as equal.
 _AREA = 0.02
-# The number of points through which to try a cut, and the number of angles at each point.
+# The number of corners through which to try a cut, and the number of angles at each corner.
 _CORNERS, _ANGLES = 6, 8
 _FAR = 1e3
 # Cells smaller than `_SMALLEST_MM` are not cut again. Cutting stops at `_MOST_CELLS` cells.
@@ -29,7 +29,7 @@ def convex_cover(
     Args:
         inner: the region to cover, without holes.
         outer: the allowed region; it contains `inner`.
-        outline: the preferred region, between the other two.
+        outline: the preferred region; it contains `inner` and lies within `outer`.
     """
     cells = _cells(inner, outer)
     grown = [_grown(seed, cells, outer) for seed in range(len(cells))]
@@ -75,7 +75,7 @@ def _corners(profile: CrossSection) -> Array:
 def _best_cut(part: CrossSection, outer: CrossSection) -> list[CrossSection]:
     """Cuts a part so that the hulls of its pieces have the least area outside `outer`."""
     best, least = [part.hull()], np.inf
-    for point in _notches(part):
+    for point in _cut_points(part):
         for angle in np.arange(_ANGLES) * 180.0 / _ANGLES:
             half = CrossSection.square((_FAR, _FAR)).translate((-_FAR / 2, 0.0)).rotate(angle)
             half = half.translate(tuple(point))
@@ -87,10 +87,11 @@ def _best_cut(part: CrossSection, outer: CrossSection) -> list[CrossSection]:
     return best
 
 
-def _notches(part: CrossSection) -> list[Array]:
-    """Returns the centre of a part, and those of its corners that lie deepest inside its hull.
+def _cut_points(part: CrossSection) -> list[Array]:
+    """Returns the points (2,) through which to try cuts of a part.
 
-    The corners are at some distance from each other.
+    These are its centre, and the corners that lie deepest inside its hull and apart from each
+    other.
     """
     corners = _corners(part)
     hull = _corners(part.hull())

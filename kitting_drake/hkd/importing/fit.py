@@ -40,8 +40,8 @@ def true_length(
 ) -> tuple[float, str]:
     """Returns the length of a tool in mm, and a phrase for the user that explains it.
 
-    Meshes often have no unit. The unit is then the only one in which the hand can hold the tool and
-    a kit has room for it.
+    Meshes often have no unit. It is then assumed to be the only unit in which the hand can hold the
+    tool and a kit has room for it.
 
     Args:
         length: the length of the tool at rest, in the unit of its file.
@@ -89,6 +89,9 @@ def fit(
 ) -> tuple[Tool, Manifold]:
     """Makes a tool of a given length in mm, and writes its visual mesh.
 
+    Returns:
+        The tool, and its solid in mm in the tool frame T.
+
     Raises:
         UserError: the hand cannot hold the tool, or a kit has no room for it.
     """
@@ -115,12 +118,12 @@ def _check_size(solid: Manifold) -> None:
     if height < THINNEST_MM:
         raise UserError(
             f"at a length of {length:.0f} mm the tool is {height:.1f} mm thick, but the hand needs "
-            f"at least {THINNEST_MM:.0f} mm"
+            f"at least {THINNEST_MM:.0f} mm: check --unit and --length_mm"
         )
     if height > HIGHEST_MM:
         raise UserError(
             f"at a length of {length:.0f} mm the tool is {height:.0f} mm high at rest, but a kit "
-            f"has room for at most {HIGHEST_MM:.0f} mm"
+            f"has room for at most {HIGHEST_MM:.0f} mm: check --unit and --length_mm"
         )
 
 

@@ -47,10 +47,11 @@ def read_drawing(path: Path, unit_mm: float | None = None, frame: str | None = N
         path: the path of the drawing.
         unit_mm: the length in mm of a unit of the drawing; None takes the unit from the file (see
             `svg_curves` and `dxf_curves`).
-        frame: whether a rectangle around all other curves is the `page` or the `tool`; None: this
-            is decided if it is clear.
+        frame: whether a rectangle around all other curves is the `page` or the `tool`. None: it is
+            inferred from the drawing.
 
     Raises:
+        FrameError: it cannot be inferred whether a rectangle is the page or the tool.
         UserError: the file is missing or not a drawing, its size is unknown, a curve is open, or
             the drawing is not the outline of one tool.
     """

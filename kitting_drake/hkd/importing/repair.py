@@ -205,9 +205,9 @@ def _fixed(fixer: pymeshfix.PyTMesh) -> Manifold | None:
 
 
 def _loses(triangles: Array, solid: Manifold) -> bool:
-    """Whether a solid lacks visible parts of triangles (n, 3, 3), or has many more.
+    """Whether a solid lacks or adds large visible parts, compared with triangles (n, 3, 3).
 
-    The projections of both along x, y and z are compared.
+    The projections of the solid and of the triangles along x, y and z are compared.
     """
     if solid.is_empty():
         return True

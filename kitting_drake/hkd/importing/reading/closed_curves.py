@@ -38,7 +38,8 @@ _BOX = 0.9
 """The least share of its bounding box that a rectangle fills, even if its corners are round."""
 _THE_PAGE = "the page"
 _PAGE = 0.85
-"""A rectangle is the page if the ratios of their sides are between this and its reciprocal."""
+"""A rectangle counts as the page if each ratio of its sides to the page's is between `_PAGE` and
+1 / `_PAGE`."""
 _HOLE, _TOOL = 0.25, 0.4
 """Shares of a rectangle's length. A curve in the rectangle that is shorter than `_HOLE` is a hole,
 and a curve that is longer than `_TOOL` may be a tool."""
@@ -89,11 +90,11 @@ def enclosed(
     Args:
         drawn: the curves.
         path: the drawing, for messages.
-        frame: whether a rectangle around all other curves is the page or the tool, one of `FRAMES`;
-            None: this is decided if it is clear.
+        frame: whether a rectangle around all other curves is the page or the tool, one of `FRAMES`.
+            None: it is inferred from the curves.
 
     Raises:
-        FrameError: the largest curve may be a frame.
+        FrameError: it cannot be inferred whether the largest curve is a frame.
         UserError: a curve is open, crosses itself, or is not inside the largest curve.
     """
     notes: list[str] = []

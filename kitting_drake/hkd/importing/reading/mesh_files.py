@@ -44,7 +44,7 @@ def read_mesh(path: Path) -> tuple[Array, Faces]:
     if path.suffix.lower() not in FORMATS:
         raise UserError(f"{path} is neither a supported mesh ({kinds}) nor an outline (SVG, DXF)")
     if size == 0:
-        raise UserError(f"{path} is empty")
+        raise UserError(f"{path} is empty: copy or export it again")
     if size > MOST_BYTES:
         raise UserError(
             f"{path} has {size / 1e6:.0f} MB, more than the limit of {MOST_BYTES / 1e6:.0f} MB: "
@@ -65,7 +65,7 @@ def read_mesh(path: Path) -> tuple[Array, Faces]:
         good = np.isfinite(vertices).all(axis=1) & (np.abs(vertices) < 1e30).all(axis=1)
     faces = faces[good[faces].all(axis=1)]
     if len(faces) == 0:
-        raise UserError(f"{path} has no triangle with finite corners")
+        raise UserError(f"{path} has no triangle with finite corners: export it again")
     used, faces = np.unique(faces, return_inverse=True)
     return vertices[used], faces.reshape(-1, 3)
 
