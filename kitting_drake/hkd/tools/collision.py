@@ -178,8 +178,8 @@ def cover(
 ) -> list[np.ndarray]:
     """Covers `hulls` with few convex hulls, which may overlap. The result is deterministic.
 
-    Each hull is a seed that grows by the neighbour that adds the least volume. The xy projection of
-    the grown hull must stay within `allowed`; the other projections may grow by at most `tolerance`
+    Each hull is a seed. It is repeatedly merged with the neighbour that adds the least volume. The
+    xy projection must stay within `allowed`; the other projections may grow by at most `tolerance`
     (mm). Then grown hulls are selected, each the one that covers the most uncovered volume, until
     all of `hulls` are covered. Finally, hulls that hardly change any projection are dropped.
     """

@@ -79,7 +79,7 @@ def flat_obj(
 
 
 def _rows(line: str, values: np.ndarray) -> str:
-    """Formats the rows of an array (n, m). To format all at once is three times as fast."""
+    """Formats the rows of an array (n, m) in one operation, three times as fast as row by row."""
     return (line * len(values)) % tuple(values.ravel().tolist())
 
 

@@ -160,7 +160,12 @@ def without_holes(profile: CrossSection) -> CrossSection:
 
 
 def _stitched(rings: np.ndarray, caps: tuple[np.ndarray, np.ndarray]) -> Manifold:
-    """Joins equal loops `rings` (m, n, 3) by quads, and closes the ends by caps."""
+    """Makes a solid: joins m loops of n points each by quads, and closes the ends by caps.
+
+    Args:
+        rings: the loops (m, n, 3).
+        caps: the triangles (k, 3) of the first and the last loop, as indices of its points.
+    """
     count, size = rings.shape[:2]
     i = np.arange(size)
     j = (i + 1) % size

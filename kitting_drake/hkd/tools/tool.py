@@ -245,13 +245,13 @@ def _shared(tool: Tool, changed: tuple[int, ...]) -> Tool:
 
     Args:
         tool: a tool.
-        changed: the modification times of its meshes, which are part of the key.
+        changed: the modification times of the tool's meshes, which are part of the cache key.
     """
     return tool
 
 
 def check_category(category: str) -> None:
-    """Raises UserError if a name is not valid for a category."""
+    """Raises UserError if a text is not valid as the name of a category."""
     if not re.fullmatch(r"[a-z][a-z0-9_]{0,31}", category):
         raise UserError(
             f"category '{category}' must consist of lower-case letters, digits and underscores, "
