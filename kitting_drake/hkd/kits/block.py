@@ -74,9 +74,9 @@ class _Surface:
 
         Args:
             outer_loops: the loops of the wider, upper ring.
-            outer: the index of its first vertex.
+            outer: the index of the upper ring's first vertex.
             inner_loops: the loops of the narrower, lower ring.
-            inner: the index of its first vertex.
+            inner: the index of the lower ring's first vertex.
         """
         band = np.asarray(triangulate(outer_loops + [loop[::-1] for loop in inner_loops]))
         starts = np.cumsum([0, *map(len, inner_loops[:-1])])

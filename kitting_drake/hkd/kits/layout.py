@@ -1,8 +1,8 @@
 """The layout of a kit: the size of its block, and the poses and outlines of its cavities.
 
 A toolset has at most one tool of each of the paper's categories. Its tools are placed in the slots
-of a template. Tools are nested instead if they are no toolset, if one is too large for its slot, or
-if `always_nested` is set. The block of nested tools has the smallest size found, or a given size.
+of a template. Tools are nested instead if they are not a toolset, if one is too large for its slot,
+or if `always_nested` is set. The block of nested tools has the smallest size found or a given size.
 """
 
 import dataclasses

@@ -143,14 +143,14 @@ def nest_on(
         placements = _fill_strip(parts, order, strip, math.inf)
         if placements is None:
             continue
-        fitted = _on(_tightened(shapes, placements, wall), room, lengthwise)
+        fitted = _centred_on(_tightened(shapes, placements, wall), room, lengthwise)
         if fitted is not None:
             return fitted
     least = nest(shapes, wall)
-    return least and (_on(least, room, True) or _on(least, room, False))
+    return least and (_centred_on(least, room, True) or _centred_on(least, room, False))
 
 
-def _on(nesting: Nesting, room: tuple[float, float], lengthwise: bool) -> Nesting | None:
+def _centred_on(nesting: Nesting, room: tuple[float, float], lengthwise: bool) -> Nesting | None:
     """Centres a nesting on a larger rectangle; turns it by 90 degrees unless `lengthwise`.
 
     Returns None if the nesting is too large.
@@ -200,10 +200,10 @@ class _Part:
         self._spectra: dict[tuple[int, int], tuple[Spectrum, Spectrum]] = {}
 
     def spectra(self, canvas: tuple[int, int]) -> tuple[Spectrum, Spectrum]:
-        """Returns two conjugate spectra.
+        """Returns the complex conjugate spectra of two masks on a canvas of (rows, columns).
 
-        The first is of the cells that another shape's `solid` may not occupy, the second of those
-        that another shape's `keep_out` may not occupy.
+        The first mask has the cells that another shape's `solid` may not occupy. The second mask
+        has the cells that another shape's `keep_out` may not occupy.
         """
         if canvas not in self._spectra:
             self._spectra[canvas] = (
@@ -317,9 +317,9 @@ def _lowest_place(
     strip: tuple[int, int],
     canvas: tuple[int, int],
 ) -> tuple[int, int] | None:
-    """Returns the lowest possible place (row, column) of a part's corner, or None.
+    """Returns the lowest possible place (row, column) of a part's corner, or None if none is free.
 
-    Of equally low places, it is the leftmost.
+    Of equally low places, the leftmost is returned.
     """
     rows, columns = strip[0] - part.size[0] + 1, strip[1] - part.size[1] + 1
     if rows <= 0 or columns <= 0:
