@@ -69,8 +69,11 @@ def _typed(kind: type[HeadEnd | Shaft], value: Any, field: str) -> Any:
     try:
         return kind(**value) if isinstance(value, dict) else value
     except TypeError as error:
-        known = ", ".join(f.name for f in fields(kind))
-        raise UserError(f"hammer: {field} may only have the fields {known}") from error
+        known = [f.name for f in fields(kind)]
+        unknown = ", ".join(f"'{key}'" for key in value if key not in known)
+        raise UserError(
+            f"hammer: {field} has the unknown field {unknown}: give one of {', '.join(known)}"
+        ) from error
 
 
 def build_hammer(p: HammerParameters) -> list[Part]:

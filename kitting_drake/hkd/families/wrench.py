@@ -54,8 +54,11 @@ def _head(value: Head | dict[str, Any], name: str) -> Head:
     try:
         return Head(**value) if isinstance(value, dict) else value
     except TypeError as error:
-        known = ", ".join(f.name for f in fields(Head))
-        raise ValueError(f"{name} may only have the fields {known}") from error
+        known = [f.name for f in fields(Head)]
+        unknown = ", ".join(f"'{key}'" for key in value if key not in known)
+        raise ValueError(
+            f"{name} has the unknown field {unknown}: give one of {', '.join(known)}"
+        ) from error
 
 
 def build_wrench(p: WrenchParameters) -> list[Part]:
