@@ -123,7 +123,7 @@ def import_mesh(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
     console.print(f"  see {report.directory}/outline.png", soft_wrap=True)
     named = d["name"] if args.output is None else report.directory.resolve()
     console.print(
-        f"files: {report.directory}/; its name in a scenario is '{named}'", soft_wrap=True
+        f"files: {report.directory}/; the tool's name in a scenario is '{named}'", soft_wrap=True
     )
 
 
@@ -341,7 +341,7 @@ def _describe_import(importer: argparse.ArgumentParser) -> None:
     importer.add_argument(
         "--frame",
         metavar="WHAT",
-        help="page or tool: what a rectangle is that encloses all other curves of a drawing",
+        help="page or tool: the meaning of a rectangle that encloses all other curves of a drawing",
     )
     importer.add_argument("--mass_g", type=float, help="the weighed mass of the tool in grams")
     importer.add_argument(
