@@ -184,8 +184,8 @@ def _packings(
     if len(kits) == 1:
         count = min(len(order), int(room[0] * room[1] / areas[0]) + 1)
         order = order[:count]
-        # Try each number of turned copies, placed before or after the others. Then turn copies at
-        # random, because the densest packing may be a pinwheel.
+        # Try each number of turned copies, placed before or after the other copies. Then turn
+        # copies at random, because the densest packing may be a pinwheel.
         for first, number in itertools.product((False, True), range(count + 1)):
             patterns.append([first] * number + [not first] * (count - number))
         mixtures = np.random.default_rng(0).random((_MIXTURES, count)) < 0.5

@@ -40,7 +40,7 @@ _ROOMY = 4.0
 _STEEPEST = 4
 """The largest sideways step of a cut for each step forward, in cells."""
 _UPRIGHT_ENDS = 6.0
-"""A cut begins and ends perpendicular to the block's sides, for this length in mm."""
+"""The length, in mm, of both ends of a cut that is perpendicular to the block's sides."""
 _REPAIRS = 8
 """The largest number of attempts to find cuts that leave no thin wall."""
 _BARRED = 400.0

@@ -39,7 +39,7 @@ _ROOT = 1.0
 
 @dataclass(frozen=True)
 class Joint:
-    """A dovetail of piece `owner` in a socket of piece `other`; both are indices."""
+    """A dovetail of the piece with the index `owner`, in a socket of the piece `other`."""
 
     owner: int
     other: int

@@ -9,7 +9,7 @@ from manifold3d import CrossSection, JoinType
 from numpy.typing import NDArray
 
 LEAST_WALL = 1.2
-"""The least thickness of a wall, in mm: three lines of a nozzle of 0.4 mm."""
+"""The least thickness of a wall, in mm: three lines printed with a nozzle of 0.4 mm."""
 
 _SHARPEST = math.radians(42)
 """The angle in radians below which a corner counts as a thin wall."""

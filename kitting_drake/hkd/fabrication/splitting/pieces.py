@@ -43,7 +43,7 @@ class Piece:
 
 @dataclass(frozen=True)
 class Split:
-    """A block in pieces."""
+    """The pieces of a block, and the joints between them."""
 
     pieces: tuple[Piece, ...]
     joints: tuple[Joint, ...]
