@@ -56,8 +56,8 @@ class HammerParameters:
     face_material: str = "polished_steel"
     handle_material: str = "hickory"
     grip_material: str = "painted_wood"
-    # Other kinds of hammers have two ends and a shaft, which replace the face, the claw and the
-    # handle above. Each of the three is given as an object or as a mapping of its fields.
+    # Other kinds of hammers have `front`, `back` and `shaft`, which replace the face, the claw and
+    # the handle above. Each of these is given as an object or as a mapping of the object's fields.
     front: HeadEnd | dict[str, Any] | None = None
     back: HeadEnd | dict[str, Any] | None = None
     shaft: Shaft | dict[str, Any] | None = None

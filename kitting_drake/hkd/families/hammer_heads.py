@@ -50,7 +50,7 @@ class HeadEnd:
     gap_mm: float = 0.0
     # Whether the striking face has a milled waffle pattern.
     milled: bool = False
-    # The material of the outermost few millimetres, such as a face or a plastic cap. A key of
+    # The material of the outermost few millimetres, such as a face or a plastic cap: a key of
     # solids.MATERIALS.
     tip_material: str = "polished_steel"
 

@@ -52,7 +52,7 @@ _HEX = 2 / math.sqrt(3)
 
 @dataclass(frozen=True)
 class PartGrasp:
-    """A grasp in the part's frame: the jaws close along +y rotated by theta about +z."""
+    """A grasp in the part's frame. The jaws close along the y axis, rotated by theta about z."""
 
     width_mm: float
     top_mm: float

@@ -141,7 +141,7 @@ def _shank_cells(p: WrenchParameters) -> list[CrossSection]:
 
 
 def _rectangle(x_low: float, x_high: float) -> CrossSection:
-    """Returns the strip between two values of x."""
+    """Returns a rectangle between two values of x that is wider than any wrench."""
     return CrossSection.square((x_high - x_low, 200.0)).translate((x_low, -100.0))
 
 
@@ -180,8 +180,8 @@ def _shank(p: WrenchParameters) -> np.ndarray:
 
 
 def _swung(p: WrenchParameters) -> np.ndarray:
-    """Returns the middle line (n, 2) of an S-shaped shank; its middle is straight, for a
-    gripper."""
+    """Returns the middle line (n, 2) of an S-shaped shank. It is straight in the middle, where a
+    gripper holds the wrench."""
     half = p.center_distance_mm / 2
     corners = [(-half, 0.0), (-_BEND * half, p.swing_mm), (_BEND * half, -p.swing_mm), (half, 0.0)]
     # Close the loop far below, so that only the two bends are rounded.

@@ -103,9 +103,6 @@ def _flat_part(
     return Part(name, material, shape.solid, shape.hulls)
 
 
-# Open ends.
-
-
 def _open(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape:
     """Draws a disc with two jaws in front.
 
@@ -153,9 +150,6 @@ def _open(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape:
         _put(CrossSection([slot]), x, turn_deg),
         cells=[_put(cell, x, turn_deg) for cell in cells] if head.neck_mm else [],
     )
-
-
-# Closed ends.
 
 
 def _socket(head: Head) -> CrossSection:
@@ -221,9 +215,6 @@ def _tail(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape:
     """Draws a round end with a hole to hang up the wrench."""
     disc = CrossSection([circle(head.diameter_mm / 2, (x, 0.0), 32)])
     return HeadShape(disc, CrossSection([circle(head.size_mm / 2, (x, 0.0), 32)]))
-
-
-# Heads with moving jaws.
 
 
 def _knurled(radius: float, length: float, ridges: int) -> Part:
@@ -358,9 +349,6 @@ def _pipe(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape:
     )
 
 
-# Hooks.
-
-
 def _hook(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape:
     """Draws a third of a ring that ends in a nose pointing at the ring's centre.
 
@@ -382,9 +370,6 @@ def _hook(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape:
     )
     hook = CrossSection([nose]).rotate(34.0).translate((0.0, radius))
     return HeadShape(_put(arc + hook, x, turn_deg), CrossSection())
-
-
-# Ends without jaws.
 
 
 def _spike(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape:
