@@ -16,7 +16,8 @@ class CatalogueError(UserError):
 
 @dataclass
 class GraspEntry:
-    """An annotated grasp in frame T: the jaws close along +y rotated by theta about +z."""
+    """An annotated grasp in the tool frame T. The jaws close along the y axis, rotated by theta
+    about z."""
 
     x_mm: float = 0.0
     y_mm: float = 0.0

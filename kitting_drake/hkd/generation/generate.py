@@ -68,8 +68,8 @@ class Report:
     # The largest distances of the collision outline outside and inside the visual outline.
     outside_mm: float
     inside_mm: float
-    # Differences of collision geometry minus visual geometry: lowest point, highest point, gripped
-    # width.
+    # The lowest point, the highest point and the gripped width of the collision geometry, minus
+    # those of the visual geometry.
     bottom_error_mm: float
     top_error_mm: float
     grip_error_mm: float
