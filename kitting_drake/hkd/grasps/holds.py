@@ -81,7 +81,7 @@ def reach_of(points: Array, level: NDArray[np.int64], levels: Array, theta: floa
     u_min = u.min() - FINGER_COLUMNS * BIN
     columns = int((u.max() - u_min) / BIN) + FINGER_COLUMNS + 2
     bins = ((u - u_min) / BIN).astype(int)
-    # NumPy's `at` is faster with one index than with two.
+    # Use one index for each cell: `np.maximum.at` is faster with one index than with two.
     cells = bins * len(levels) + level
     left = np.full(columns * len(levels), -np.inf)
     right = np.full(columns * len(levels), np.inf)
