@@ -27,8 +27,8 @@ thinned. A pair is tried if the one before it needs too many hulls."""
 ADDED_SHARE = 0.05
 """The largest volume that one hull may add above and below the tool, as a share of the tool's
 volume."""
-# Vertices are thinned with the first tolerance that leaves at most `_MOST_VERTICES`, or else with
-# the last one. The outline has its own tolerance.
+# The vertices of a hull are thinned with the first tolerance that leaves at most `_MOST_VERTICES`.
+# If none does, the last tolerance is used. The outline has its own tolerance.
 _MOST_VERTICES = 20
 _VERTEX_TOLERANCES_MM = (0.2, 0.3, 0.45, 0.6)
 _OUTLINE_VERTEX_TOLERANCE_MM = 0.08
@@ -44,7 +44,8 @@ class Decomposition:
     hulls: list[np.ndarray]
     """The vertices (n, 3) of each hull, in mm."""
     outline_deviation_mm: float
-    """The largest distance between the hulls' outline from above and the solid's, at most 5 mm."""
+    """The largest distance between the hulls' outline from above and the solid's, in mm. A larger
+    distance than 5 mm is given as 5 mm."""
 
 
 def decompose(solid: Manifold, grasp: Grasp) -> Decomposition:

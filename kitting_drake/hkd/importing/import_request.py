@@ -41,10 +41,10 @@ class ImportRequest:
     output: Path | None = None
     """The folder of tools to write to. None: `user_tools`."""
     height_mm: float | None = None
-    """The height in mm to which an outline is extruded. A mesh has none."""
+    """The height in mm to which an outline is extruded; None for a mesh."""
     frame: str | None = None
     """Whether a rectangle around all other curves of a drawing is the page or the tool: one of
-    `closed_curves.FRAMES`. None: the user is asked if this is not clear."""
+    `closed_curves.FRAMES`. None: it is inferred from the drawing."""
     outline_error_mm: float = 0.0
     """See `Tool.outline_error`."""
 

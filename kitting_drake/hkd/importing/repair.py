@@ -21,7 +21,7 @@ from kitting_drake.hkd.importing.closing import capped
 # Meshes are scaled to this length for repair. The tolerances below refer to it.
 NOMINAL_MM = 180.0
 
-# Vertices in the same cell of this grid are merged.
+# Vertices in the same cell of a grid with this spacing are merged.
 _MERGE_MM = 1e-3
 # Bodies that are farther apart than this are separate objects. An object with less than the share
 # `_DIRT` of the volume is removed.
@@ -38,7 +38,7 @@ _MOST_COMPONENTS = 3000
 _VOXEL_MM = 0.75
 # The largest share of a hollow's volume that may lie outside the body around it.
 _OUTSIDE = 0.01
-# The share of its bounding box below which a mesh counts as one without volume.
+# A mesh that fills less than this share of its bounding box counts as one without volume.
 _HOLLOW = 0.002
 
 Array = NDArray[np.float64]

@@ -38,8 +38,8 @@ _BOX = 0.9
 """The least share of its bounding box that a rectangle fills, even if its corners are round."""
 _THE_PAGE = "the page"
 _PAGE = 0.85
-"""A rectangle counts as the page if each ratio of its sides to the page's is between `_PAGE` and
-1 / `_PAGE`."""
+"""A rectangle counts as the page if each of its sides is `_PAGE` to 1 / `_PAGE` times as long as
+the page's side."""
 _HOLE, _TOOL = 0.25, 0.4
 """Shares of a rectangle's length. A curve in the rectangle that is shorter than `_HOLE` is a hole,
 and a curve that is longer than `_TOOL` may be a tool."""
@@ -151,7 +151,8 @@ def _as_frame(
     if (
         frame == "tool"
         or box.area.area() < _BOX * sides.prod()
-        # The second curve is the rectangle drawn again, or the inner side of its thick line.
+        # In these two cases, the second curve is the rectangle drawn again, or the inner side of
+        # the rectangle's thick line.
         or box.area.area() < 1.02 * inside.area.area()
         or (box.area.offset(-_LINE_MM, JoinType.Miter) - inside.area).area()
         < 0.001 * box.area.area()

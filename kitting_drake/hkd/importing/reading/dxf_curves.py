@@ -112,7 +112,7 @@ def _hidden_layers(document: Any) -> set[str]:
 
 
 def _drop_control_points(entity: Any) -> None:
-    """Removes the control points that a polyline smoothed as a spline keeps among its vertices."""
+    """Removes a smoothed polyline's control points, which are stored among its vertices."""
     if entity.dxftype() == "POLYLINE" and entity.dxf.flags & _SMOOTHED:
         entity.vertices[:] = [v for v in entity.vertices if not v.dxf.flags & _CONTROL_POINT]
 
