@@ -31,7 +31,7 @@ class _Surface:
         self._count = 0
 
     def add_vertices(self, vertices: NDArray[np.float64]) -> int:
-        """Adds vertices (n, 3); returns the index of the first."""
+        """Adds vertices (n, 3); returns the index of the first vertex."""
         self._vertices.append(vertices)
         self._count += len(vertices)
         return self._count - len(vertices)
@@ -42,7 +42,7 @@ class _Surface:
 
     def add_ring(self, loops: list[NDArray[np.float64]], z: float) -> int:
         """Adds the vertices of closed loops, each (n, 2), at height z; returns the index of the
-        first."""
+        first vertex."""
         flat = np.concatenate(loops)
         return self.add_vertices(np.column_stack([flat, np.full(len(flat), z)]))
 

@@ -35,7 +35,8 @@ _FORMAT_VERSION = "9"
 class Kit:
     """A kit block on disk.
 
-    The kit frame K: z up, the origin in the centre of the block's bottom, x along its length.
+    The kit frame K has z up, x along the block's length, and its origin in the centre of the
+    block's bottom.
     """
 
     sdf: Path
@@ -54,7 +55,7 @@ class Kit:
         return self.parameters.length, self.parameters.width, self.parameters.height
 
     def goal(self, index: int) -> CavityPose:
-        """The goal pose in K of the frame T of the tool with this index."""
+        """The goal pose of the tool frame T in K, for the tool with this index."""
         return self.layout.poses[index]
 
 

@@ -63,7 +63,7 @@ class KitParameters:
         return self.least_clearance < TIGHT
 
     def of_tool(self, name: str) -> "KitParameters":
-        """Returns the parameters of one tool's cavity: the same, with this tool's clearance."""
+        """Returns the parameters of one tool's cavity, with this tool's clearance."""
         if name not in self.clearance_of:
             return self
         return replace(self, clearance=self.clearance_of[name], clearance_of={})
