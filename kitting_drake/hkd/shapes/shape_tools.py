@@ -179,7 +179,7 @@ def _write(
     if not proposals:
         raise UserError(
             "the hand cannot hold the shape from above (the jaws open to at most "
-            f"{1e3 * WIDEST:.0f} mm)"
+            f"{1e3 * WIDEST:.0f} mm): give another scale"
         )
     grasp = min(proposals, key=_rank).grasp
     meshes.write_smooth_obj(folder / f"{colour}.obj", solid, _CREASE_DEG)
@@ -210,7 +210,8 @@ def _rank(proposal: GraspProposal) -> float:
     """Returns the cost of a grasp of a shape.
 
     Shapes are far apart in their kit, so the penalty for neighbours is left out. The centre of mass
-    counts more than for a hand tool: a shape has no handle, and its ends hardly fill the pads.
+    counts more than for a hand tool: a shape has no handle, and a grasp near its end touches only a
+    small part of the pads.
     """
     beside = proposal.offset / _BESIDE
     return proposal.cost - proposal.penalties["neighbour in the kit"] + beside
