@@ -113,8 +113,8 @@ def convex_cells(inner: CrossSection, outer: CrossSection) -> list[CrossSection]
     """Covers the region `inner` with few convex polygons that stay within `outer` and may overlap.
 
     The largest uncovered triangle of `inner` grows by neighbouring triangles as long as their hull
-    is within `outer`. Some of these triangles may be covered by earlier cells; the hull of the
-    others is the new cell. This repeats until all triangles are covered.
+    is within `outer`. The hull of those that earlier cells do not cover is the new cell. This
+    repeats until all triangles are covered.
     """
     loops = inner.to_polygons()
     corners = np.vstack(loops)

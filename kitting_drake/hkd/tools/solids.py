@@ -128,7 +128,7 @@ def fillet(
 
 
 def rounded_rectangle(width: float, height: float, radius: float, segments: int = 4) -> np.ndarray:
-    """Returns a rectangle about the origin with arcs as corners: 4 (segments + 1) vertices."""
+    """Returns a rectangle (n, 2) about the origin with arcs as corners; n = 4 (segments + 1)."""
     x, y = width / 2, height / 2
     radius = min(radius, 0.98 * min(x, y))
     return fillet([(-x, -y), (x, -y), (x, y), (-x, y)], radius, segments)
@@ -154,9 +154,6 @@ def without_holes(profile: CrossSection) -> CrossSection:
     """Fills the holes of a profile."""
     outer = [p for p in profile.to_polygons() if CrossSection([p]).area() > 0]
     return CrossSection(outer) if outer else profile
-
-
-# Solids.
 
 
 def _stitched(rings: np.ndarray, caps: tuple[np.ndarray, np.ndarray]) -> Manifold:
