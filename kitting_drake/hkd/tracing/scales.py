@@ -37,7 +37,7 @@ class Scale:
     length_mm: float = 0.0
     """The distance between the two points, in mm."""
     disc_mm: float | None = None
-    """The diameter of a disc or coin."""
+    """The diameter of a disc or coin, in mm."""
     board: tuple[int, int, float, float] | None = None
     """Columns, rows, and the sides of a square and a marker of a ChArUco board, in mm."""
     dictionary: str = "DICT_4X4_50"
@@ -205,7 +205,7 @@ def _by_board(cv2: Any, photo: Photo, scale: Scale, camera_mm: float | None) -> 
             "show the whole board, and check --board and --dictionary"
         )
     points = board.getChessboardCorners()[ids.ravel(), :2].astype(float)
-    # In the board's own frame, y points down along its rows.
+    # OpenCV's frame of the board has y pointing down. Flip it, so that y points up.
     points[:, 1] = rows * square - points[:, 1]
     pixels = corners.reshape(-1, 2).astype(float)
     homography, _ = cv2.findHomography(points, pixels)

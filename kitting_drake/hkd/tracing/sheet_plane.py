@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 SHEETS = {"a4": (297.0, 210.0), "letter": (279.4, 215.9)}
 """The sides of sheets of paper in mm, the longer side first."""
 _ASPECT_ERROR = 0.025
-"""The largest error of the ratio of a sheet's sides at which its format is recognised."""
+"""The largest `_aspect_error` at which the format of a sheet is recognised."""
 _GIVEN_ASPECT_ERROR = 0.06
 _FOCALS_35MM = (22.0, 24.0, 26.0, 28.0, 31.0)
 """Typical 35 mm equivalent focal lengths of phones, for photos that do not state theirs."""
@@ -148,7 +148,8 @@ def _choose(
 
 
 def _aspect_error(photo: Photo, corners: Array, size: tuple[float, float]) -> float:
-    """Returns the error of the logarithm of the ratio of a sheet's sides.
+    """Returns the difference between the logarithms of the ratios of a sheet's sides: in the photo,
+    and in `size`.
 
     If the focal length is not known, this is the smallest error at any of `_FOCALS_35MM`.
     """

@@ -51,7 +51,7 @@ _LEAST_HOLE_RADIUS_MM = 0.7
 
 @dataclass(frozen=True)
 class ShadowLook:
-    """The limits by which shadows are told from tools."""
+    """The limits that distinguish shadows from tools."""
 
     steep: float
     """The largest slope of the logarithm of light, per mm, at the edge of a shadow."""
@@ -63,12 +63,12 @@ class ShadowLook:
 
 
 CAREFUL = ShadowLook(0.3, 2.0, 1.2)
-"""The look for high tools, whose shadows have soft edges: faint edges belong to tools."""
+"""The limits for high tools, whose shadows have soft edges: faint edges belong to tools."""
 MIDDLE = ShadowLook(0.45, 3.0, 1.2)
-"""The look for low tools and for tools of unknown height."""
+"""The limits for low tools and for tools of unknown height."""
 BOLD = ShadowLook(0.65, 4.0, math.inf)
-"""A look for a second opinion: faint edges belong to shadows. Where its mask differs from that of
-another look, the outline is in doubt."""
+"""The limits for a second opinion: faint edges belong to shadows. Where the mask for these limits
+differs from that for other limits, the outline is in doubt."""
 _LOW_MM = 9.0
 _COARSE_PX_PER_MM = 3.5
 _FINE_PX_PER_MM = 5.0
@@ -76,7 +76,7 @@ _FINE_PX_PER_MM = 5.0
 
 
 def look_for(height: float | None, px_per_mm: float) -> ShadowLook:
-    """Returns the look that suits the height of the tools and the resolution of the photo.
+    """Returns the limits that suit the height of the tools and the resolution of the photo.
 
     `CAREFUL` does not suit a coarse photo, in which a shadow's edge is as rough as a tool.
 
@@ -90,7 +90,7 @@ def look_for(height: float | None, px_per_mm: float) -> ShadowLook:
 
 
 class ToolMasks:
-    """Computes masks of the tools in one photo, for different looks."""
+    """Computes masks of the tools in one photo, for different limits."""
 
     def __init__(
         self, cv2: Any, ratio: Array, ground: Array, spread: float, px_per_mm: float
@@ -118,7 +118,7 @@ class ToolMasks:
         even = cv2.GaussianBlur(light, (0, 0), 0.5 * px_per_mm)
         self._rough = _roughness(cv2, light, even, px_per_mm)
         self._usual = _median(self._rough[self._plain & ground], _ROUGH)
-        # The steepest step near each pixel, and how wide it is.
+        # The slope and the width of the steepest step of light near each pixel.
         self._peak = cv2.dilate(self._steep, _disc(cv2, 0.7 * px_per_mm))
         disc = _disc(cv2, _STEP_REACH_MM * px_per_mm)
         span = cv2.dilate(self._lightness, disc) - cv2.erode(self._lightness, disc)
@@ -147,7 +147,7 @@ class ToolMasks:
         shaded = free & (self._fine < 2 * limit) & ~reached
         reached |= _shaded_holes(cv2, shaded, like_ground, px_per_mm)
         # The edge of a tool is rough on both sides. So extend the ground over rough pixels, up to
-        # a steep step.
+        # a steep step of light.
         for _ in range(math.ceil(_EDGE_MM * px_per_mm)):
             grown = cv2.dilate(reached.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
             reached |= grown & free
@@ -228,7 +228,7 @@ class ToolMasks:
         return filled
 
     def _bordered(self, tool: Array) -> Array:
-        """Moves the border of a mask to the steepest step nearby."""
+        """Moves the border of a mask to the steepest step of light nearby."""
         cv2, px_per_mm = self._cv2, self._px_per_mm
         markers = np.zeros(tool.shape, np.int32)
         markers[cv2.dilate(tool, _disc(cv2, 0.4 * px_per_mm)) == 0] = 1

@@ -97,7 +97,7 @@ class TracedTool:
 
 @dataclass(frozen=True)
 class TraceReport:
-    """The outlines of a photo, and notes for the user."""
+    """The outlines traced in a photo, and notes for the user."""
 
     tools: list[TracedTool]
     notes: list[str]
