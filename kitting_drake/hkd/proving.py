@@ -10,7 +10,7 @@ from kitting_drake.hkd.generation.part_models import load_named
 
 
 def describe_proof(maker: argparse.ArgumentParser) -> None:
-    """Adds the flags."""
+    """Adds the flags `--prove`, `--prove_with` and `--workers`."""
     maker.add_argument(
         "--prove",
         type=count_type,
@@ -52,7 +52,7 @@ def tools_to_prove(tools: Sequence[str], given: Sequence[tuple[str, str]]) -> li
         given: pairs of a tool's name or folder and the tool to put into its cavity instead.
 
     Returns:
-        A folder for each of `tools`; empty if `given` is.
+        A folder for each of `tools`; an empty list if `given` is empty.
 
     Raises:
         UserError: a tool does not exist, or a name is not that of a tool of the kit.
@@ -65,7 +65,7 @@ def tools_to_prove(tools: Sequence[str], given: Sequence[tuple[str, str]]) -> li
     unknown = [name for name in others if name not in names]
     if unknown:
         listed = ", ".join(tool.name for tool in loaded)
-        raise UserError(f"--prove_with: '{unknown[0]}' is not a tool of this kit: it has {listed}")
+        raise UserError(f"--prove_with: the kit has no tool '{unknown[0]}': give one of {listed}")
     chosen = [
         others.get(name) or others.get(tool.name) or tool
         for name, tool in zip(tools, loaded, strict=True)

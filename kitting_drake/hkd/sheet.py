@@ -157,7 +157,7 @@ def render_subject(
 
 
 def _kept_picture(subject: Subject) -> np.ndarray:
-    """Returns the picture of a subject from the cache, or renders it."""
+    """Returns the picture of a subject from the cache; renders it if it is missing."""
     digest = hashlib.sha256(f"{_FORMAT_VERSION} {versions()}".encode())
     digest.update(f"{subject.target} {subject.size} {subject.elevation_deg}".encode())
     for path, X_WB in subject.models:
@@ -186,8 +186,8 @@ def _add_table(scene_graph: SceneGraph) -> None:
 def write_sheet(subjects: Iterable[Subject], count: int, output: Path) -> None:
     """Writes one picture of all the subjects with their titles.
 
-    The picture of each subject is kept in the cache, so a sheet that was interrupted continues
-    where it stopped.
+    The picture of each subject is stored in the cache, so that a call after an interruption
+    continues where the interrupted call stopped.
 
     Args:
         subjects: the contents of the pictures.

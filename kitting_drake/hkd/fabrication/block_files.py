@@ -72,8 +72,8 @@ def threemf_bytes(surface: Triangles, title: str, labels: Triangles | None = Non
     Args:
         surface: the block.
         title: the title.
-        labels: letters of another colour that fill the engraved ones. The object then has two
-            parts, each with its own base material.
+        labels: the letters of another colour that fill the engraved labels; None: there are none.
+            With letters, the object has two parts, each with its own base material.
     """
     if labels is None:
         resources, built = [_object(1, title, surface, "")], 1

@@ -77,7 +77,7 @@ class KitFiles:
     block: Manifold
     """The block in the frame of the files, in mm."""
     letters: Manifold | None
-    """The letters of a second colour, in the same frame; None: there are none."""
+    """The letters of a second colour, in the frame of the files, in mm. None: there are none."""
     split: Split | None
     """The pieces of the block. None: the block is not split."""
     sheet: FoamSheet | None

@@ -186,19 +186,22 @@ def _clearance_of(request: KitRequest, loaded: Mapping[str, Tool]) -> dict[str, 
 
 
 def _widened(request: KitRequest, tool: Tool) -> float:
-    """The clearance of a tool whose outline is uncertain, in metres: wider by its error, but not
-    beyond the template's clearance for this reason."""
+    """Returns the clearance, in metres, of a tool whose outline is uncertain.
+
+    The requested clearance is increased by the outline's error, up to the template's clearance.
+    """
     default = KitParameters().clearance
     asked = default if request.clearance_mm is None else 1e-3 * request.clearance_mm
     return round(max(asked, min(asked + tool.outline_error, default)), 7)
 
 
 def error_notes(request: KitRequest, tools: Sequence[Tool]) -> list[str]:
-    """A sentence for each tool whose cavity is wider because its outline is uncertain."""
+    """Returns a sentence for each tool whose cavity is wider because its outline is uncertain."""
     given = {name for name, _ in request.fit_of}
     notes = {
-        tool.name: f"the cavity of '{tool.name}' has {1e3 * _widened(request, tool):g} mm on each "
-        f"side, because its outline may be off by {1e3 * tool.outline_error:g} mm: "
+        tool.name: f"the cavity of '{tool.name}' has a clearance of "
+        f"{1e3 * _widened(request, tool):g} mm on each side, because its outline may be off by "
+        f"{1e3 * tool.outline_error:g} mm: "
         f"--fit_of {tool.name}=FIT sets another clearance"
         for name, tool in zip(request.tools, tools, strict=True)
         if tool.outline_error and not given & {name, tool.name}

@@ -1,5 +1,5 @@
-"""Finds the place of a tool in a cavity that was made for another outline of it, such as one traced
-from a photo."""
+"""Finds the pose of a tool in a cavity that was made for another outline of the tool, such as one
+traced from a photo."""
 
 import math
 from dataclasses import dataclass
@@ -38,7 +38,7 @@ class Seat:
 def find_seat(tool: CrossSection, model: CrossSection, cavity: CrossSection) -> Seat:
     """Finds the pose at which a tool has the most room in a cavity.
 
-    The search starts where the outlines of the tool and of its model agree best.
+    The search starts where the outlines `tool` and `model` agree best.
 
     Args:
         tool: the outline of the tool, in its own frame, in metres.
@@ -102,9 +102,9 @@ def _moved(points: Points, x: float, y: float, yaw: float) -> Points:
 
 
 def _aligned(points: Points, target: Points) -> tuple[float, float, float]:
-    """Returns the x, y and yaw that move points (n, 2) onto a target, by their nearest neighbours.
+    """Returns the x, y and yaw that move points (n, 2) onto target points.
 
-    The search starts at each quarter turn.
+    They are found by the iterative closest point algorithm, which starts at each quarter turn.
     """
     tree = cKDTree(target)
     best, least = (0.0, 0.0, 0.0), math.inf

@@ -229,7 +229,9 @@ def load_tool(name: str, base: Path | None = None) -> Tool:
     if not np.isfinite([dataclasses.astuple(grasp) for grasp in tool.grasps]).all():
         raise UserError(f"{record_path}: grasp must consist of finite numbers")
     if not 0 <= tool.outline_error < math.inf:
-        raise UserError(f"{record_path}: outline_error must not be negative")
+        raise UserError(
+            f"{record_path}: outline_error is {tool.outline_error:g}; it must be 0 or more"
+        )
     if tool.symmetry < 1:
         raise UserError(f"{record_path}: symmetry is {tool.symmetry}; it must be 1 or more")
     return _shared(tool, tuple(path.stat().st_mtime_ns for path in tool.visual_meshes))

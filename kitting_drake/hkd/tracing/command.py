@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from kitting_drake.hkd.tracing.tracer import TracedTool
 
 _OUTLINE_ERROR_MM = 0.5
-"""How far tools extend beyond outlines without a doubt, at most places. Cavities are wider by
-this."""
+"""A tool extends by less than this, in mm, beyond almost all of a traced outline that is not in
+doubt. Cavities are wider by this."""
 
 
 def describe_trace(tracer: argparse.ArgumentParser) -> None:

@@ -89,7 +89,7 @@ def read_photo(path: Path) -> Photo:
 
 
 def _rgb(picture: Image.Image) -> Image.Image:
-    """Converts a picture to RGB with 8 bits; what is transparent becomes white."""
+    """Converts a picture to RGB with 8 bits; transparent pixels become white."""
     if picture.mode.startswith("I"):
         # Pillow would clip gray values of 16 bits instead of scaling them.
         picture = Image.fromarray((np.asarray(picture) >> 8).clip(0, 255).astype(np.uint8))

@@ -33,12 +33,13 @@ _GLARE, _GLARE_SPREADS = 0.025, 5.0
 """The least brightness of glare above the ground, in logarithms of light and in standard deviations
 of the ground's light."""
 _GLARE_REACH_MM, _GLARE_GAP_MM, _GLARE_MM2, _GLARE_SHARE = 8.0, 2.5, 0.7, 0.25
-"""How far glare reaches from the rest of its tool, half the width of the strip between the two, the
-least area, and the share of an added region that must be brighter than the ground."""
+"""The largest distance of glare from the rest of its tool; half the largest width of the strip
+between them; the least area of an added region; and the least share of this region that must be
+brighter than the ground."""
 _BAY_MM = 12.0
 """Half the largest width, in mm, of the bays and holes that may be reflections."""
 _BLENDED_MM, _SHADED = 1.2, 0.06
-"""The width of a step of light, in mm, above which a tool blends into what is beside it; and the
+"""The width of a step of light, in mm, above which a tool blends into its surroundings; and the
 least darkness of a shadow, in logarithms of light."""
 _NEUTRAL = 0.05
 _LARGEST_HOLE_MM2 = 500.0
@@ -180,8 +181,9 @@ class ToolMasks:
     def _with_glare(self, tool: Array) -> Array:
         """Adds the regions beside a tool where it shines more brightly than the ground.
 
-        No light makes the ground beside a tool brighter. Between tool and glare, the shine is as
-        bright as the ground; this strip is added, too.
+        Such regions are glare on the tool, because light never makes the ground beside a tool
+        brighter. A strip between the tool and its glare may be as bright as the ground; it is
+        added, too.
         """
         cv2, px_per_mm = self._cv2, self._px_per_mm
         least = max(_GLARE, _GLARE_SPREADS * self._spread)
@@ -192,7 +194,7 @@ class ToolMasks:
             tool | bright, cv2.MORPH_CLOSE, _disc(cv2, _GLARE_GAP_MM * px_per_mm)
         )
         added = both & ~tool & 1
-        # Keep the strips that lead to glare, and no notches that the closing has filled.
+        # Keep the strips that lead to glare, but not the notches that the closing has filled.
         _, labels, stats, _ = cv2.connectedComponentsWithStats(added, connectivity=4)
         share = np.bincount(labels[bright > 0], minlength=len(stats)) / np.maximum(stats[:, 4], 1)
         kept = (share > _GLARE_SHARE) & (stats[:, 4] > _GLARE_MM2 * px_per_mm**2)

@@ -60,7 +60,7 @@ def test_true_tools_are_named_for_the_tools_of_the_kit():
     rod, plate = tools_to_prove(tools, (("rod_80x14", "rod_81x14"),))
     assert load_tool(rod).name == "rod_81x14"
     assert load_tool(plate).name == "plate_90x40x8"
-    with pytest.raises(UserError, match="'bar' is not a tool of this kit: it has rod_80x14, plate"):
+    with pytest.raises(UserError, match="the kit has no tool 'bar': give one of rod_80x14, plate"):
         tools_to_prove(tools, (("bar", "rod_81x14"),))
 
 
