@@ -51,8 +51,10 @@ class WrenchParameters:
 
 
 def _head(value: Head | dict[str, Any], name: str) -> Head:
+    if not isinstance(value, dict):
+        return value
     try:
-        return Head(**value) if isinstance(value, dict) else value
+        return Head(**value)
     except TypeError as error:
         known = [f.name for f in fields(Head)]
         unknown = ", ".join(f"'{key}'" for key in value if key not in known)

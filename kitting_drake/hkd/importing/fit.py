@@ -130,7 +130,7 @@ def _check_size(solid: Manifold) -> None:
 def _tool(
     category: str, name: str, solid: Manifold, directory: Path, density: float | None
 ) -> Tool:
-    """Writes the visual mesh of a solid and finds its best grasp.
+    """Returns the tool of a solid with its grasps, and writes the tool's visual mesh.
 
     Raises:
         UserError: the hand cannot hold the tool.

@@ -206,7 +206,7 @@ def _write(
     say("making its collision hulls")
     collision = decompose(solid, tool.grasp)
     if not collision.hulls:
-        raise UserError("the mesh encloses too little volume for collision hulls")
+        raise UserError("the mesh encloses too little volume for collision hulls: repair it first")
     if collision.outline_deviation_mm > _TRUE_OUTLINE_MM:
         notes.append(
             f"its {len(collision.hulls)} collision hulls are up to "
