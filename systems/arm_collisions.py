@@ -24,8 +24,8 @@ class Capsule:
 
 @dataclass(frozen=True)
 class _Link:
-    """A capsule that is fixed to a frame: 0 to 6 are the frames of joints 1 to 7, 7 is the
-    flange's."""
+    """A capsule that is fixed to a frame of the arm. Frames 0 to 6 are those of joints 1 to 7, and
+    frame 7 is the flange's."""
 
     frame: int
     capsule: Capsule
@@ -54,8 +54,8 @@ _HAND = _Link(
 _UPPER_ARM = _Link(2, Capsule((0.0, 0.0, -0.20), (0.0, 0.0, -0.06), 0.06))
 _ELBOW = _Link(3, Capsule((0.0, 0.0, -0.06), (0.0, 0.0, 0.06), 0.06))
 _ABOVE = (_ELBOW, _FOREARM, _WRIST, _LAST)
-"""The links that could hit the table or the objects. The hand is left out: its fingers work among
-them."""
+"""The links that could hit the table or the objects. The hand is left out, because its fingers work
+among the objects."""
 _OUTER = (_FOREARM, _WRIST, _LAST, _HAND)
 """The links that could hit the arm's own base."""
 _LEAST = 0.01

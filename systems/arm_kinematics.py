@@ -263,8 +263,8 @@ def inverse_of_flange(
     x, y, z7 = rotation[..., 0], rotation[..., 1], rotation[..., 2]
     c, s = np.cos(q7)[..., None], np.sin(q7)[..., None]
     x6, z6 = c * x - s * y, c * y + s * x
-    # Rotated back by q7, frame 7 is frame 6 turned by pi/2 about x. So its y axis is z6 and its z
-    # axis -y6.
+    # Frame 7 is frame 6, turned by pi/2 about x and then by q7 about z. So x6 and z6 are the x and
+    # y axes of frame 7 turned back by q7, and y6 is -z7.
     y6 = -z7
     wrist = origin - _D_FLANGE * z7 - _A7 * x6
     shoulder = np.array([0.0, 0.0, _D1])

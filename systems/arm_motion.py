@@ -274,8 +274,8 @@ class ArmMotion(JawMotion):
         way.line = goal
 
     def _set_retreat(self, state: ArmState, way: WayVector) -> None:
-        """Sets the motion up and back to the x of the home pose. The home's y and yaw need not be
-        reached."""
+        """Sets a motion that rises and then returns to the x of the home pose. The home's y and yaw
+        need not be reached."""
         now = way.start[:JOINTS]
         y = float(self.postures.hand_pose(now)[1])
         way.sink = max(self._wait_height, float(state.travel_z))

@@ -25,7 +25,8 @@ from systems.arm_limits import JOINTS, ArmLimits
 MARGIN = 0.03
 """Least distance of a posture from the ends of the joints' ranges, in rad."""
 _SWIVELS = np.concatenate([sign * np.arange(0.1, 3.15, 0.1) for sign in (1.0, -1.0)])
-"""The swivels, in rad, that are tried if the vertical plane fails. `ArmPostures` defines them."""
+"""The swivels, in rad, that are tried if the arm cannot lie in the vertical plane. `ArmPostures`
+defines the swivel."""
 _CHECKED = 12
 """Number of points of a path that are checked for collisions."""
 _JUMP = 1.5
@@ -79,8 +80,8 @@ class ArmPostures:
         return np.array(hand_state(q.tolist(), [0.0] * JOINTS, self.base)[:4])
 
     def within(self, q: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """(...) whether joint positions (..., 7) are not NaN and at least the margin inside their
-        ranges."""
+        """Returns (...) whether joint positions (..., 7) are at least `MARGIN` away from the ends
+        of their ranges. It is False for NaN."""
         with np.errstate(invalid="ignore"):
             return np.asarray(((q >= self._lower) & (q <= self._upper)).all(-1))
 

@@ -168,8 +168,8 @@ def plan_action(
 
     Contacts are not known in advance. So the arm descends to the grasp height, and the jaws get the
     time to close and to open fully. The held object is lowered to the surface that o_t shows at its
-    place, but the fingertips stay above the rim of a cavity, where the object may drop the rest of
-    the way.
+    place. If the place is in a cavity, the fingertips stay above its rim, and the object may drop
+    the rest of the way.
 
     Args:
         motion: plans the arm's motions.

@@ -24,8 +24,8 @@ _SPACING = 0.010
 """Spacing of a path's points, in s: the time that the slowest joint takes from one to the next at
 full speed."""
 _ROUNDING, _WIDER = 0.15, 0.3
-"""Lengths of path over which corners are rounded, as times like `_SPACING`: for a path with two
-corners, and for a path with one."""
+"""Each corner of a path is rounded over this length, given as a time in s like `_SPACING`. `_WIDER`
+holds for paths with only one corner."""
 _FEWEST, _MOST = 40, 200
 _TRIES, _PATIENCE = 8, 3
 """A path that crosses too low is raised at most `_TRIES` times; after `_PATIENCE` tries, by more
@@ -34,9 +34,11 @@ _ANY_ACCELERATION = 1e3
 """Acceleration of the yaw on a straight line, in rad/s^2. It is so large that only the joints'
 limits matter."""
 _NEARLY_THERE = 0.02
-"""Within this horizontal distance of its end the hand may sink below the clear height, in m."""
+"""Within this horizontal distance of the path's end, in m, the hand may sink below the clear
+height."""
 _STRAIGHT_UP = 0.006
-"""Within this horizontal distance of its start the hand may still rise, in m."""
+"""Within this horizontal distance of the path's start, in m, the hand may be below the clear
+height."""
 _HALF_JAWS, _HALF_PALM = MAX_OPENING / 2 + FINGER_DEPTH, max(PALM_SIZE) / 2
 """How far the open jaws and the palm reach to the side, in m."""
 _INSTANT = 1e-9
@@ -64,8 +66,8 @@ class WayVector(VectorView):
     yaw_speed = Number()
     """Largest rate of the yaw on the line."""
     over = Array(JOINTS)
-    """Goal of a path that crosses: joint positions at the clear height, or at the goal if that is
-    higher."""
+    """Goal of a path that crosses: joint positions with the hand at or above the clear height. From
+    there the hand sinks to `sink`."""
     clear = Number()
     """Height of the fingertips above which the hand may travel."""
     sink = Number()
@@ -202,8 +204,8 @@ class ArmWay:
         poses = np.array([self._postures.hand_pose(point) for point in path.points])
         yaw = np.unwrap(poses[:, 3])
         fast, middle, slow = way.speeds.tolist()
-        # The speed limit at a point depends on the lower one of its height and the next point's
-        # height.
+        # The speed limit at a point depends on its own height or on the next point's, whichever is
+        # lower.
         below = np.minimum(poses[:, 2], np.append(poses[1:, 2], poses[-1, 2]))
         limit = np.where(below < way.marks[1], slow, np.where(below < way.marks[0], middle, fast))
         high = np.column_stack([np.repeat(limit[:, None], 3, 1), np.full(len(yaw), way.yaw_speed)])

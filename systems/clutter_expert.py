@@ -33,8 +33,8 @@ class ClutterExpert:
 
     An object goes to its goal if it lies flat and the right way up, has nothing on top of it, and
     can be gripped near its best grasp. If there is no such object, an object with nothing on top of
-    it is laid aside on a free part of the table. If it does not come to rest flat and free, it is
-    laid aside again.
+    it is laid aside on a free part of the table. If it does not come to rest flat and uncovered, it
+    is laid aside again.
     """
 
     def __init__(

@@ -136,12 +136,12 @@ class ClutteredTable:
         ]
 
     def flat_heading(self, index: int, X_WB: RigidTransform) -> float | None:
-        """The heading, in radians, of an object that lies the way it fits into its cavity; else
-        None.
+        """Returns an object's heading, in radians; None if it does not lie as it would in its
+        cavity.
 
-        The object lies flat and the right way up, or has a shape that looks the same after it
-        rolled, such as a round handle. The heading of a rolled object is the one at which its shape
-        looks the same.
+        It must lie flat and the right way up, or have a shape that looks the same after it rolled,
+        such as a round handle. The heading of a rolled object is the one at which its shape looks
+        the same.
         """
         yaw = heading(X_WB)
         if tilt(X_WB) < _FLAT:

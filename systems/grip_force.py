@@ -14,9 +14,10 @@ _EASY_MOMENT = 0.18
 """A moment about the axis of the pads that friction holds easily, in N m."""
 _MOMENT_ARM = 0.0030
 """While the hand accelerates, the pads hold a moment up to their force times this length, in m. A
-long round handle begins to turn at a length of 5 mm."""
+long round handle begins to turn if the moment exceeds the force times 5 mm."""
 _HELD_MOMENT = 0.30
-"""Largest moment, in N m, that the pads hold in motion if they hold it at rest."""
+"""An object that does not turn between the pads at rest does not turn in motion either if its
+moment is below this, in N m."""
 _NOTABLE_MOMENT = 0.10
 """A moment that a poor grip might not hold, in N m."""
 _INDULGENCE = 0.5
@@ -27,7 +28,8 @@ _SOFT, _SOFT_SHARE = 0.006, 0.2
 """If the jaws sink farther into an object than this, in m, or than this share of its width, they
 press less."""
 _MUCH_LESS = 0.85
-"""The force on an object into which the jaws sink falls only in steps of at least this factor."""
+"""The force on an object into which the jaws sink is reduced only if it falls to this share of its
+present value, or below."""
 _GENTLE, _GENTLEST = 0.5, 0.25
 """Shares of the acceleration limits: for an object that may turn, and the least one for any
 object."""

@@ -212,7 +212,7 @@ def motion_duration(
     delays: NDArray[np.float64],
     legs: Sequence[Leg] = (),
 ) -> float:
-    """Duration of `motion_at`, in s."""
+    """Duration of the motion that `motion_at` computes, in s."""
     ends = [
         delay + travel_time(distance, *limit)
         for _, _, distance, limit, delay in _ways(start, goal, start_rate, limits, delays, legs)

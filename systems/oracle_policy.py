@@ -159,7 +159,7 @@ class OraclePolicy(LeafSystem):
             raise ValueError("an oracle needs at least one goal")
         for index in {index for goal in goals for index in goal.objects}:
             if not grasps[index]:
-                raise ValueError(f"{objects[index].name} has no grasp")
+                raise ValueError(f"{objects[index].name} may fill a goal, but has no grasp")
         self._objects, self._goals, self._success = tuple(objects), tuple(goals), success
         self._grasps = tuple(tuple(choices) for choices in grasps)
         self._quantizer, self._brings_heights = quantizer, brings_heights

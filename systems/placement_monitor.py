@@ -88,7 +88,10 @@ class PlacementMonitor(LeafSystem):
                 raise ValueError(f"the goal {goal.name} needs an object and a pose")
         for item in objects:
             if item.p_BPoints.ndim != 2 or item.p_BPoints.shape[1] != 3 or not len(item.p_BPoints):
-                raise ValueError(f"the points of {item.name} must be (m, 3) with m > 0")
+                raise ValueError(
+                    f"the points of {item.name} must have the shape (m, 3) with m > 0, not "
+                    f"{item.p_BPoints.shape}"
+                )
         self._objects, self._goals, self._success = tuple(objects), tuple(goals), success
         self._body_poses = self.DeclareAbstractInputPort("body_poses", Value([RigidTransform()]))
         self._mode = self.DeclareVectorInputPort("mode", 1)

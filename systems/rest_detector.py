@@ -117,8 +117,8 @@ class RestDetector(LeafSystem):
         Args:
             objects: n bodies that may come to rest.
             movers: bodies that never rest: the links of the hand.
-            position_tolerance: the position tolerance of the body's origin, in m.
-            angle_tolerance: the tolerance of the body's orientation, in rad.
+            position_tolerance: how far the origin of an object that stays in place may move, in m.
+            angle_tolerance: how far an object that stays in place may rotate, in rad.
             time_to_sleep: how long an object must stay in place, in s.
             wake_distance: distance at which something wakes an object, in m. A body that moves
                 farther than this within one period may hit an object at rest, which stays fixed

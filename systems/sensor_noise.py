@@ -248,7 +248,8 @@ def noisy_depth(
         parameters: the parameters of the noise.
         camera: the camera's intrinsics.
         random: the random generator of all draws.
-        sheen: (height, width) share of holes on each surface; None for no sheen.
+        sheen: (height, width) for each pixel, the share of its surface that becomes holes; None if
+            no surface is shiny.
     """
     seen = np.isfinite(depth) & (depth > 0)
     z = np.where(seen, depth, 1.0).astype(np.float32)

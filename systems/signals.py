@@ -42,9 +42,14 @@ class PixelGrid:
 
     def __post_init__(self) -> None:
         if self.rows < 1 or self.cols < 1 or self.resolution <= 0:
-            raise ValueError("rows, cols and resolution of a pixel grid must be positive")
+            raise ValueError(
+                "rows, cols and resolution of a pixel grid must be positive, not "
+                f"{self.rows}, {self.cols} and {self.resolution:g}"
+            )
         if self.z_max <= self.z_min:
-            raise ValueError("z_max of a pixel grid must be above z_min")
+            raise ValueError(
+                f"z_max of a pixel grid must be above z_min, {self.z_min:g}, not {self.z_max:g}"
+            )
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -126,8 +131,8 @@ _SHADOW = np.ones((3, 3), bool)
 """A hole into which this square fits may be the shadow of an object. Narrower ones are gaps between
 the points of a camera."""
 _HIDDEN_BELOW = 0.005
-"""A neighbour of a shadow that is higher than this above its lowest neighbour may be what hides it,
-in metres."""
+"""Pixels around a shadow that are higher than the lowest of them by more than this, in metres, may
+belong to the object that casts the shadow."""
 
 
 def fill_unseen(

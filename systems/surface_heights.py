@@ -59,7 +59,8 @@ def read_surface_heights(
     - The table is assumed to be level and at the bottom of the grid. If it looks tilted or shifted
       in o_t, this counts as a calibration error, and `project` has subtracted it.
     - A table that looks more than 3 mm lower than expected is an exception: it is assumed to be
-      lower. Motions that stop at a contact may aim too low, but must not end too high.
+      lower. A motion that aims too low stops at the contact, but one that aims too high ends above
+      the surface.
 
     Args:
         observation: the observation o_t.

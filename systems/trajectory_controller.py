@@ -115,7 +115,9 @@ class TrajectoryController(LeafSystem):
             "force_limit": force_limit,
         }.items():
             if np.shape(value) != (HAND_AXES,):
-                raise ValueError(f"{name} must hold {HAND_AXES} numbers, not {np.shape(value)}")
+                raise ValueError(
+                    f"{name} must have the shape ({HAND_AXES},), not {np.shape(value)}"
+                )
         if np.any(np.asarray(force_limit) <= 0) or fingers.force_limit <= 0:
             raise ValueError("force limits must be positive")
         # For each axis: inertia, weight, stiffness, damping, force limit.
