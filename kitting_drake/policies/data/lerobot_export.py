@@ -236,9 +236,14 @@ def _check_alike(read: EpisodeFrames, first: EpisodeFrames, source: Path) -> Non
             )
     if list(read.images) != list(first.images) or not len(read):
         raise UserError(
-            f"{source}: it has other cameras than the first episode, or no frames: export only "
-            "episodes with the same settings"
+            f"{source}: it has {len(read)} frames from {_cameras_of(read)}, but the first episode "
+            f"has {len(first)} from {_cameras_of(first)}: export only episodes with frames and the "
+            "same settings"
         )
+
+
+def _cameras_of(episode: EpisodeFrames) -> str:
+    return ", ".join(episode.images) or "no camera"
 
 
 def _statistics(

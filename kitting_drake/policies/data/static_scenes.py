@@ -159,8 +159,12 @@ def read_static_scenes(path: Path) -> StaticScenes:
         with h5py.File(path) as file:
             if file.attrs.get("format") != FORMAT:
                 raise UserError(f"{path} is not a file of static scenes")
-            if file.attrs["format_version"] != FORMAT_VERSION:
-                raise UserError(f"{path} has another format version: draw the scenes again")
+            version = file.attrs["format_version"]
+            if version != FORMAT_VERSION:
+                raise UserError(
+                    f"{path} has format version {version}, but version {FORMAT_VERSION} is "
+                    "needed: draw the scenes again"
+                )
             grid = PixelGrid(**json.loads(file.attrs["grid"]))
             heights, actions, first = (file[key][()] for key in ("height", "actions", "first"))
             _check(heights, actions, first, grid)

@@ -27,8 +27,8 @@ from systems.signals import PickPlaceAction, PixelGrid, PlanarPose
 Array = NDArray[np.float64]
 
 _LAYERS = (0.008, 0.014, 0.022, math.inf)
-"""Depths of the topmost object below a heap's highest point, in metres, in the order in which they
-are tried."""
+"""How far the topmost object is assumed to reach below a heap's highest point, in metres. The
+depths are tried in this order."""
 _LEAST_LAYER = 12
 """The least number of pixels of a layer that may be an object."""
 _REACH = 0.030

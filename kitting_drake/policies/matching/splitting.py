@@ -58,10 +58,11 @@ _LEAST_PART = 0.35
 """A region whose area is less than this share of a recess's area contains no object of that
 recess."""
 _HIGHER = 0.006
-"""The least height, in metres, above an object's median height of something that lies on it."""
+"""Pixels that are higher than an object's median height by more than this, in metres, belong to
+something that lies on the object."""
 _ACROSS = 6
-"""The least number of pixels, on each side of an object's outline, of something that lies across
-the outline."""
+"""Something lies across an object's outline if at least this many of its pixels are inside the
+outline, and as many outside."""
 _SLIVER = 1
 """The rest of a region is thinned by this many pixels, to drop slivers."""
 _LEAST_REST = 0.0002

@@ -138,9 +138,12 @@ class NetworkConfig:
             raise ValueError(f"colour must be true or false, not '{self.colour}'")
         scales = (self.colour_std, self.height_std)
         if not all(map(math.isfinite, (self.colour_mean, self.height_mean, *scales))):
-            raise ValueError("means and standard deviations must be finite")
+            raise ValueError(
+                "means and standard deviations must be finite, not "
+                f"{(self.colour_mean, self.height_mean, *scales)}"
+            )
         if min(scales) <= 0:
-            raise ValueError("a standard deviation must be positive")
+            raise ValueError(f"standard deviations must be positive, not {scales}")
 
     @property
     def channels(self) -> int:

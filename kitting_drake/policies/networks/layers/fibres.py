@@ -74,7 +74,9 @@ class Irreps:
 
     def __post_init__(self) -> None:
         if list(self.frequencies) != sorted(set(self.frequencies)) or min(self.frequencies) < 0:
-            raise ValueError("frequencies must be non-negative and ascending")
+            raise ValueError(
+                f"frequencies must be non-negative and ascending, not {self.frequencies}"
+            )
         if 0 < self.samples <= 2 * max(self.frequencies):
             raise ValueError(
                 f"{self.samples} samples cannot hold frequency {max(self.frequencies)}: "
