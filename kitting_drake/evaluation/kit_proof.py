@@ -310,8 +310,8 @@ def _verdict(proof: KitProof, wider: list[KitProof]) -> str:
         advice = "Wider cavities would not help."
         if worst.causes["slipped"]:
             advice += (
-                " It slips from the hand: if it is lighter than its tool.yaml says, make it again "
-                "with --mass_g, else the hand has no good grasp of it."
+                f" The {worst.name} slips from the hand: if the tool is lighter than its tool.yaml "
+                "says, make it again with --mass_g; otherwise the hand has no good grasp of it."
             )
     elif cure is None:
         tried = " or ".join(f"{item.clearance_mm:g}" for item in wider)

@@ -24,8 +24,7 @@ TIMED_OUT = "timed out"
 """The cause of all objects of an episode that the time limit ended."""
 
 UNKNOWN = "unknown"
-"""The category of the single object as which a failed episode counts if no other episode has
-objects."""
+"""If no episode has objects, a failed episode counts as one object of this category."""
 
 AMBIGUITIES = {
     "protruding": ("height_error_mm", 1e3 * STRICT_HEIGHT),
@@ -177,8 +176,8 @@ def counted_objects(episodes: Sequence[Episode]) -> list[list[Entry]]:
     """The objects of each episode that count, which are those for which a goal was left.
 
     In a failed or timed-out episode no object is a success or has errors. If the episode's process
-    died, the names of its objects may be unknown. It then counts, for each category, as many
-    objects as the episode with the most of them.
+    died, the names of its objects may be unknown. For each category, such an episode gets as many
+    failed objects as the episode with the most of them.
     """
     found = [
         [item for item in episode["objects"] if item["add_s_mm"] is not None]

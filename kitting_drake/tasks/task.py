@@ -158,12 +158,14 @@ class ActionRecord:
     """Distance of the pick from the nearest of the object's annotated grasps, in mm; None if the
     object has no grasps."""
     pick_angle_error_deg: float | None
-    """Angle between the pick and this nearest grasp, modulo half rotations: 0 to 90 degrees."""
+    """Angle between the pick and the nearest annotated grasp, modulo half rotations: 0 to 90
+    degrees."""
     place_position_error_mm: float | None
     """Distance between the object's middle and its goal, in mm, if the object moved rigidly with
     the hand from pick to place; None if the object can fill no goal."""
     place_angle_error_deg: float | None
-    """Heading error after this rigid motion, modulo the object's symmetry: 0 to 180 degrees."""
+    """Heading error, modulo the object's symmetry, if the object moved rigidly with the hand: 0 to
+    180 degrees."""
     peak_force_n: PeakForce | None = None
     """The largest contact force during the action; None before a force is known."""
 

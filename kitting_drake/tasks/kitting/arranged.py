@@ -73,11 +73,12 @@ class ArrangedKitting(KittingTask):
             name = scene.objects[goal.objects[0]].name
             things[f"task.kit_pose: the cavity of {name}"] = goal.poses[0]
         for name, X_WThing in things.items():
-            if not grid.contains(X_WThing.translation()[:2]):
+            x, y, _ = X_WThing.translation().tolist()
+            if not grid.contains((x, y)):
                 raise UserError(
-                    f"{name} is not in the workspace: choose x from {grid.x_min:g} to "
-                    f"{grid.x_max:g} m and y from {grid.y_min:g} to {grid.y_max:g} m, or enlarge "
-                    "heightmap"
+                    f"{name} at ({x:.3g}, {y:.3g}) m is not in the workspace: choose x from "
+                    f"{grid.x_min:g} to {grid.x_max:g} m and y from {grid.y_min:g} to "
+                    f"{grid.y_max:g} m, or enlarge heightmap"
                 )
 
     def input_files(self, base: Path) -> list[Path]:

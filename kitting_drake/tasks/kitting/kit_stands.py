@@ -76,8 +76,8 @@ class KitStand:
         return self.R_KLevelK.IsNearlyIdentity(1e-12)
 
     def margin(self, kit: Kit) -> float:
-        """How far the tilted block extends beyond the outline of the level block at most, in
-        metres."""
+        """The largest distance, in metres, by which the tilted block extends beyond the level
+        block's outline."""
         return 0.0 if self.is_level else float(self._corners(kit)[:, :2].max(initial=0.0))
 
     def lifted(self, kit: Kit, X_WLevel: RigidTransform) -> RigidTransform:

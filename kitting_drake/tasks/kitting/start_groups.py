@@ -92,7 +92,8 @@ def _apart(block: Group, kit: Kit, tools: Sequence[Tool], rng: np.random.Generat
 def _paired(
     pair: Callable[[Tool, Tool, np.random.Generator], RigidTransform],
 ) -> Callable[..., list[Group]]:
-    """Makes groups of two tools. `pair` draws the pose of the second tool relative to the first."""
+    """Returns a function that makes groups of two tools. `pair` draws the pose of the second tool
+    of a group relative to the first."""
 
     def draw(
         block: Group, kit: Kit, tools: Sequence[Tool], rng: np.random.Generator

@@ -36,7 +36,7 @@ def test_wider_cavities_are_no_cure_for_tools_that_slip():
     assert not proof(0.15, 10, 10).may_be_tight
     slips = proof(0.15, 4, 10, cause="slipped")
     assert not slips.may_be_tight
-    assert "would not help. It slips from the hand" in _verdict(slips, [])
+    assert "would not help. The hammer slips from the hand" in _verdict(slips, [])
 
 
 @pytest.mark.slow
