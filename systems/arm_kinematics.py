@@ -28,8 +28,8 @@ HAND_TURN = -math.pi / 4
 _A = (0.0, 0.0, 0.0, _A4, -_A4, 0.0, _A7)
 _D = (_D1, 0.0, _D3, 0.0, _D5, 0.0, 0.0)
 _TWIST = (0.0, -1.0, 1.0, 1.0, -1.0, 1.0, 1.0)
-"""sin(alpha) of each joint's Denavit-Hartenberg twist; cos(alpha) is 1 for the first and 0 for the
-others."""
+"""sin(alpha) of each joint's Denavit-Hartenberg twist; cos(alpha) is 1 for joint 1 and 0 for the
+other joints."""
 _HAND_X = (math.cos(HAND_TURN), math.sin(HAND_TURN))
 """The hand's x axis, as x and y components in the flange's frame."""
 TIP_DISTANCE = _D_FLANGE + FINGERTIP_DISTANCE

@@ -52,7 +52,8 @@ class ArmState(PlannerState):
     way_start = Number()
     """The time at which the present motion began, in s."""
     pick_joints = Array(JOINTS)
-    """Joint positions above the pick, in rad. `place_joints` are those above the place."""
+    """Joint positions with the hand above the pick, in rad. `place_joints` are those with the hand
+    above the place."""
     place_joints = Array(JOINTS)
 
 
@@ -153,7 +154,7 @@ class ArmMotion(JawMotion):
         return not self._prepare(self.view(state.vector))
 
     def _prepare(self, state: ArmState) -> str:
-        """Does the work of `prepare`. Returns the sentence of `reach_problem`."""
+        """Chooses the joint positions for `prepare`. Returns the sentence of `reach_problem`."""
         now = self._way(state).at(math.inf)[:JOINTS]
         found, problem = self.postures.choose(self.stops(state), now)
         if problem:
@@ -289,8 +290,8 @@ class ArmMotion(JawMotion):
     def waiting_joints(
         self, y: float, now: NDArray[np.float64], surface: float, z: float | None = None
     ) -> NDArray[np.float64]:
-        """Returns (7) joint positions, in rad, at the x of the home pose and as near to a y as the
-        arm can be.
+        """Returns (7) joint positions, in rad, with the hand at the x of the home pose and as near
+        to a given y as possible.
 
         Args:
             y: wanted y of the hand in the world, in m.

@@ -129,7 +129,7 @@ class ArmPostures:
 
         Returns:
             (7) joint positions for each stop, and a sentence that says why the arm cannot reach the
-            stops; it is empty if it can.
+            stops. The sentence is empty if the arm can.
         """
         options: list[list[tuple[int, NDArray[np.float64]]]] = []
         problem = ""

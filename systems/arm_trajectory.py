@@ -299,7 +299,7 @@ class _Recorder:
         self.samples.append(self._motion.motion_at(state, self._point / self._rate))
 
     def _mode(self, mode: Mode, settle: float = 0.0, stop_force: float | None = None) -> None:
-        """Begins a mode, and samples it until it has arrived and then rested for `settle`
+        """Begins a mode, and samples its motion until the arm has arrived and rested for `settle`
         seconds."""
         state, motion, first = self._state, self._motion, self._point
         begun = first / self._rate

@@ -258,7 +258,7 @@ class ArmWay:
 
     def _missing(self, path: _Path, clear: float, reach: float) -> float:
         """How far, in m, the hand or its object sinks below the clear height between start and end;
-        not positive if both stay above."""
+        not positive if neither does."""
         tips, low = path.tips, path.tips[:, 2]
         if path.points[:, [2, 4]].any():
             low = low - _reach_below(path.points, reach)

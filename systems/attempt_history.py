@@ -68,7 +68,7 @@ class AttemptHistory:
         self.amend(outcome, peak_force)
 
     def amend(self, outcome: str | None, peak_force: float) -> None:
-        """Corrects the peak force of the latest attempt and, unless None, its outcome."""
+        """Corrects the peak force of the latest attempt, and also its outcome if one is given."""
         row = _Row(self._rows[self._count() - 1])
         row.peak_force = peak_force
         if outcome is not None:

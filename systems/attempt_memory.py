@@ -17,7 +17,7 @@ from systems.placement import PlacedObject, heading
 from systems.signals import PickPlaceAction, PlanarPose
 
 _PERIOD = 1 / 64
-"""The planner's update period, in s. The memory reads the planner's mode as often."""
+"""The planner's update period, in s. The memory reads the planner's mode at the same rate."""
 
 
 class AttemptMemory:

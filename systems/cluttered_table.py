@@ -31,10 +31,10 @@ Points = NDArray[np.float64]
 _CELL = 0.004
 """Side of the squares in which the heights of objects are compared, in metres."""
 _ABOVE = 0.002
-"""Tolerance, in metres: in a square, an object is above another if its lowest point is at most this
-far below the other's highest point."""
+"""In a square, an object counts as above another object if its lowest point is at most this far, in
+metres, below the other object's highest point."""
 _LEAST_SQUARES = 2
-"""An object lies on another if it is above it in at least this many squares."""
+"""An object lies on another object if it counts as above it in at least this many squares."""
 _FLAT = math.radians(2.5)
 """An object tilted by less than this, in radians, lies flat."""
 _SAME_SHAPE = 0.0003
@@ -139,9 +139,9 @@ class ClutteredTable:
         """Returns an object's heading, in radians; None if it does not lie as it would in its
         cavity.
 
-        It must lie flat and the right way up, or have a shape that looks the same after it rolled,
-        such as a round handle. The heading of a rolled object is the one at which its shape looks
-        the same.
+        It must lie flat and the right way up, or have rolled without a visible change, as a round
+        handle does. The heading of an object that has rolled is the one at which the flat object
+        would look most alike.
         """
         yaw = heading(X_WB)
         if tilt(X_WB) < _FLAT:
@@ -309,7 +309,7 @@ def in_the_way(points: Points, gripper: PlanarPose, tip: float, halves: tuple[fl
         points: (m, 3) in the world, in metres.
         gripper: the gripper's pose in the world.
         tip: world z of the fingertips, in metres.
-        halves: half the opening of the jaws, first closed on the object and then open, in metres.
+        halves: half the opening of the jaws that hold the object, and of the open jaws, in metres.
     """
     along, across = _in_hand(points, gripper)
     along, across, z = np.abs(along), np.abs(across), points[:, 2]
@@ -350,8 +350,8 @@ Squares = dict[tuple[int, int], tuple[float, float]]
 
 
 def _squares(points: Points) -> Squares:
-    """The lowest and highest z of the points (m, 3) in each square of the table, for squares with
-    points."""
+    """Returns the lowest and the highest z of the points (m, 3) in each square of the table that
+    has points."""
     keys, where = np.unique(
         np.floor(points[:, :2] / _CELL).astype(int), axis=0, return_inverse=True
     )

@@ -20,8 +20,8 @@ _LEAST = 0.010
 _AMPLE = 0.060
 """Clearance beyond this, in metres, has no benefit: the open hand already has room."""
 _WAY = 0.02
-"""A position one metre farther away must have this much more clearance to be preferred, in
-metres."""
+"""A position that is one metre farther away is preferred only if its clearance is larger by this,
+in metres."""
 
 
 def find_free_pose(

@@ -31,8 +31,8 @@ _MUCH_LESS = 0.85
 """The force on an object into which the jaws sink is reduced only if it falls to this share of its
 present value, or below."""
 _GENTLE, _GENTLEST = 0.5, 0.25
-"""Shares of the acceleration limits: for an object that may turn, and the least one for any
-object."""
+"""Shares of the acceleration limits: the largest one for an object that may turn, and the least one
+for any object."""
 _GENTLER = 0.8
 """A motion is restarted when its acceleration should be less than this share of the present one."""
 _LEAST_CHANGE = 1.05
@@ -130,7 +130,7 @@ def moment_at_rest(moment: float, acceleration: float) -> float:
     """The moment about the axis of the pads that the object would exert at rest, in N m.
 
     The effect of an upward acceleration is removed. No correction is made while the hand brakes,
-    because it then lags behind its command.
+    because the hand then lags behind its command.
 
     Args:
         moment: the moment felt at the wrist, in N m.

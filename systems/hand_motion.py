@@ -50,7 +50,7 @@ def blended_legs(
 
     Each leg begins when the one before begins to brake. The sum of the two motions then changes
     smoothly from one speed to the other. A leg is shortened by the distance that the next leg
-    covers during this time, so that both together end where they should. If nothing is left of a
+    covers during this time, so that their total distance stays the same. If nothing is left of a
     leg, the next leg covers its whole distance.
 
     Args:
@@ -119,7 +119,7 @@ def travel(
 
 
 def travel_time(distance: float, speed: float, acceleration: float) -> float:
-    """Duration of `travel`, in s."""
+    """Duration of the motion that `travel` computes, in s."""
     if distance <= 0:
         return 0.0
     top = min(speed, math.sqrt(distance * acceleration))

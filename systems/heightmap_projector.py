@@ -52,8 +52,9 @@ class HeightmapProjector(LeafSystem):
     - A pixel is `in_view` if it is in some camera's image at the height `z_min`.
     - A camera's samples can be farther apart than grid pixels. An unseen pixel is interpolated if
       both of its neighbours along x or along y are seen, with heights within SAME_SURFACE of each
-      other. It gets the mean of the two, or that of the higher pair if both pairs qualify. Wider
-      gaps (shadows) remain zero in all four channels and are not `valid`.
+      other. It gets the mean of these two neighbours. If the neighbours along x and those along y
+      qualify, it gets the larger mean. Wider gaps (shadows) remain zero in all four channels and
+      are not `valid`.
 
     The colour camera must be registered with the depth camera: same intrinsics, same pose.
     """

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from systems.signals import PlanarPose
 
 _OUTSIDE = (0.15, 0.6)
-"""An object is released with its centre of mass outside the edge. The distance outside is a share,
-in this range, of the part of the object that lies on the block."""
+"""An object is released with its centre of mass outside the block's edge. Its distance from the
+edge is a share of the width with which the object lies on the block. This is the range of the
+share."""
 _MOST_OUTSIDE = 0.008
 """Largest distance of the centre of mass outside the edge, in metres."""
 _BESIDE = 0.005
@@ -51,8 +52,8 @@ class Ledge:
         Args:
             outline: (k, 2) points of the held object relative to its centre of mass, first along
                 its heading and then to the left of it, in metres.
-            p_WCenter: the object's centre of mass in the world, in metres. The edge and the share
-                outside depend on it: after a failure the object lies elsewhere, and the next try
+            p_WCenter: the object's centre of mass in the world, in metres. The edge and the
+                distance from it depend on this position, so that the next try after a failure
                 differs.
             others: (m, 3) points of everything that may be in the way, in the world.
             area: lower and upper (x, y) corners of the area in which the object may land.
@@ -102,8 +103,8 @@ class Ledge:
 
 
 def _inside(outline: NDArray[np.float64]) -> float:
-    """How far an object reaches to the left of its centre of mass, in metres: the smaller one of
-    its reaches before and behind the centre of mass."""
+    """How far an object reaches to the left of its centre of mass, in metres. The reach is measured
+    before and behind the centre of mass, and the smaller value is returned."""
     u, v = outline.T
     reach = u.max() - u.min()
     sides = [(sign * u > _BESIDE) & (sign * u < 0.3 * reach) for sign in (-1, 1)]

@@ -107,8 +107,8 @@ class OraclePolicy(LeafSystem):
     2. The object: of those that may fill the goal and fill no other, the highest one, since nothing
        lies on it. Of equally high ones, the one that `evaluate_placements` assigned.
     3. The goal pose: of the goal's unoccupied poses, the one that rotates the object least.
-    4. The grasp: the first that keeps the fingers clear of other objects at the pick and the place.
-       Of these, the one that was tried least often, so that the next one follows after a slip.
+    4. The grasp: of those that keep the fingers clear of other objects at the pick and the place,
+       the one that was tried least often. So after a slip the next grasp follows.
 
     With a quantizer, the action is the best that a policy of the paper can choose. The pick is the
     rounded annotated grasp. The place is the gripper pose that brings the object, held by the
@@ -232,8 +232,8 @@ class OraclePolicy(LeafSystem):
         kept: frozenset[int],
         tried: NDArray[np.float64] | None = None,
     ) -> list[int]:
-        """Indices of the goals that may be filled now. Goals with a misplaced object come last; of
-        the others, those come first whose objects were tried least often.
+        """Indices of the goals that may be filled now. Goals without a misplaced object come first,
+        in the order of how often their objects were tried, least often first.
 
         Args:
             poses: X_WB of each of the n objects.

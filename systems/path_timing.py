@@ -7,8 +7,8 @@ and u. One pass backwards finds the largest x from which the end can be reached,
 takes the largest u.
 
 `SmoothMotion` averages such a motion over the last few milliseconds. This limits the jerk. All
-other limits still hold, because they are convex: if states are within limits of position and
-acceleration, and within velocity limits that are concave in the position, so is their average.
+other limits still hold, because they are convex: the average of states within the limits is also
+within them. For the velocity limits this is true because they are concave in the position.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ _SHARE = 0.98
 """Share of the limits that a motion uses at the path's points. Between them it uses a little
 more."""
 _RATE_SHARE = 0.9
-"""Share of the limits of the torques' rates that a motion uses. It is smaller, because the model of
-the inertia is not exact."""
+"""Share of the limits of the torques' rates that a motion uses. It is smaller than `_SHARE`,
+because the model of the inertia is not exact."""
 _LEAST, _UNLIMITED = 1e-9, 1e12
 
 

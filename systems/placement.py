@@ -104,7 +104,7 @@ class Goal:
     """Whether the object's rotation about world z is ignored."""
     rim_height: float | None = None
     """World z of the rim of the cavity that the object goes into, in metres; None if there is no
-    cavity. For a tilted cavity it is the height at the middle."""
+    cavity. For a tilted cavity it is the height of the rim's middle."""
     highest: float | None = None
     """World z of the highest point of the fixture with a tilted cavity, in metres; None if the
     cavity is level."""

@@ -94,9 +94,10 @@ class RestDetector(LeafSystem):
     - No mover, and no object that is not at rest, is within `wake_distance` of it. The distances
       are those of the oriented boxes around the collision geometry, which are lower bounds.
 
-    It wakes when a mover, or an object that is not at rest, comes within `wake_distance`. An object
-    that has left the cell (its distance from the world's origin is `GONE` or more) is at rest at
-    once, because a body that spins forever would overflow its quaternion.
+    An object at rest wakes when a mover, or an object that is not at rest, comes within
+    `wake_distance`. An object that has left the cell (its distance from the world's origin is
+    `GONE` or more) is at rest at once, because a body that spins forever would overflow its
+    quaternion.
 
     State (discrete): for each object the pose that it stays near, the time that it has stayed
     there (s), and whether it rests.

@@ -20,7 +20,7 @@ class RobotMotion(Protocol):
     """
 
     size: int
-    """Number of elements of the vector `motion_at`."""
+    """Number of elements of the vector that `motion_at` returns."""
     settles: float
     """Time after the end of a motion until the hand no longer vibrates; infinite if a parameter of
     the planner sets this time."""

@@ -119,7 +119,9 @@ class TrajectoryController(LeafSystem):
                     f"{name} must have the shape ({HAND_AXES},), not {np.shape(value)}"
                 )
         if np.any(np.asarray(force_limit) <= 0) or fingers.force_limit <= 0:
-            raise ValueError("force limits must be positive")
+            raise ValueError(
+                f"force limits must be positive, not {force_limit} and {fingers.force_limit:g}"
+            )
         # For each axis: inertia, weight, stiffness, damping, force limit.
         self._axes = [
             tuple(map(float, axis))
