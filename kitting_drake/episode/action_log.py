@@ -151,8 +151,8 @@ class ActionLog:
 def _place_errors(
     item: PlacedObject, goal: Goal, X_WGoal: RigidTransform, arrival: RigidTransform
 ) -> tuple[float, float, float]:
-    """Mean displacement (m), distance of the middles (m) and angle (rad) between an object's pose
-    and its goal.
+    """Returns the mean displacement (m), the distance of the middles (m) and the angle (rad)
+    between an object's pose and its goal.
 
     Only the planar arrival pose is known, so heights are not compared.
     """

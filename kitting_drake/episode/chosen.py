@@ -32,7 +32,7 @@ def build_chosen(chosen: ChosenScenario, *, seed: int) -> tuple[Diagram, Kitting
 def build_any_chosen(chosen: ChosenScenario, seeds: Iterable[int]) -> KittingStation:
     """Builds the station with the first of a few seeds that gives a valid scene.
 
-    A random scene may be invalid for some seeds. Then only the episodes of these seeds should fail.
+    A random scene may be invalid for some seeds, which does not make the scenario invalid.
 
     Raises:
         MachineError: this machine cannot build the station.

@@ -45,8 +45,8 @@ class DemonstrationRecorder:
             self._actions.append((observation, action))
 
     def demonstration(self, result: EpisodeResult) -> Demonstration | Rejection:
-        """Makes the demonstration of a finished episode, without its failed actions, or a
-        `Rejection`."""
+        """Makes the demonstration of a finished episode, without its failed actions. Returns a
+        `Rejection` if the episode is unsuitable for learning."""
         if result.failure or result.success_rate < LEAST_SCORE:
             reason = result.failure or f"the reward was {result.success_rate:.0%}"
             return Rejection(result.seed, result.success_rate, reason)

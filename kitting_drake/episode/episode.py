@@ -31,8 +31,8 @@ class ObjectResult:
     add_s_mm: float | None
     """ADD-S, in mm. This and the other errors are None if no goal was left for the object."""
     success: bool
-    """Whether the object fills its goal by the task's success predicate. In kitting it is the
-    paper's: ADD-S below a threshold."""
+    """Whether the object fills its goal by the task's success predicate. In kitting this is the
+    paper's predicate: ADD-S below a threshold."""
     strict_success: bool
     """Whether the object fills its goal and also has the right height and heading; see
     `systems.placement.Placement.strict_success`."""
@@ -118,7 +118,7 @@ def run_episode(
         policy: name of the policy, for the result.
         realtime_rate: 1 for real time, 0 for as fast as possible.
         observers: functions that are called with every event.
-        log: if given, samples every step.
+        log: if given, its `sample` is called after every step.
     """
     episode = Episode(
         diagram,

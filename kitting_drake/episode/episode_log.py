@@ -60,7 +60,7 @@ def log_of_many(path: Path | None, cluster: str | None) -> Path | None:
         cluster: the cluster of `--ray`, if given.
 
     Raises:
-        UserError: the file cannot be used (see `check_log`), or both options are given.
+        UserError: the file cannot be used (see `check_log`), or `--ray` is given as well.
         MachineError: a required package is not installed.
     """
     if path is None:

@@ -20,7 +20,7 @@ _COLUMNS = 5
 _MARK = {"markeredgecolor": "white", "markeredgewidth": 1.2, "markersize": 10}
 _PICK = {"color": "#e69f00", "marker": "o", **_MARK}
 _PLACE = {"color": "#009e73", "marker": "s", **_MARK}
-"""The style of the mark at the place. Colour-blind people can distinguish it from that at the
+"""The style of the mark at the place. Colour-blind people can distinguish it from the mark at the
 pick."""
 
 

@@ -103,7 +103,7 @@ class KitProof:
 
     @property
     def kitted(self) -> int:
-        """The number of tools that were kitted, counting strict successes, over all episodes."""
+        """The number of strict successes of all tools in all episodes."""
         return sum(tool.kitted for tool in self.tools.values())
 
     @property
@@ -153,9 +153,9 @@ def prove_kit(
     folder.
 
     The policy is that of the kit's scenario. In each episode the tools lie elsewhere, and all
-    cavities are wider or narrower by a common random error of `TOLERANCE_MM`. A kit that does not
-    fit is tried again with wider cavities, if these may mend its failures. A clearance that
-    certainly does not fit is given up before the last episode.
+    cavities are wider or narrower by a common random error with the standard deviation
+    `TOLERANCE_MM`. A kit that does not fit is tried again with wider cavities, if these may mend
+    its failures. If a clearance certainly does not fit, its remaining episodes are left out.
 
     Args:
         folder: a folder that `hkd kit` wrote.

@@ -62,11 +62,13 @@ def summarise(
     - If the reward is the share of successful objects, and the task declares its objects
       independent, intervals are Wilson's over objects. Otherwise (partial rewards, weights, stacks)
       they are over episodes, see `mean_interval`. `ci95_method` names the method.
-    - `outcomes` holds the seed of each episode, both rates, and for each object 2 (strict success),
-      1 (success) or 0 (failure). It allows paired comparisons of runs with the same seeds.
-    - Errors include all objects and actions of completed episodes, also those that failed. Objects
-      for which no goal was left are excluded.
-    - `measures` holds the rate of success by each other measure of the task, over objects.
+    - `outcomes` holds the seed, the success rate and the strict success rate of each episode, and
+      for each object 2 (strict success), 1 (success) or 0 (failure). It allows paired comparisons
+      of runs with the same seeds.
+    - Errors include all objects and actions of completed episodes, also failed objects and actions.
+      Objects for which no goal was left are excluded.
+    - `measures` holds, for each further measure of the task, the share of objects that succeed by
+      it.
 
     Args:
         episodes: at least one episode.
@@ -128,7 +130,8 @@ def summarise(
 
 def _commits(episodes: Sequence[Episode]) -> str | None:
     """The commits of the code that ran the episodes. There are several if the evaluation was
-    resumed with other code. If no episode has a commit, the present one is returned."""
+    resumed with other code. If no episode has a commit, the commit of the present code is
+    returned."""
     found = dict.fromkeys(str(episode["commit"]) for episode in episodes if episode.get("commit"))
     return ", ".join(found) or commit()
 
@@ -320,7 +323,8 @@ def find_ambiguities(item: Mapping[str, Any]) -> list[str]:
 
 
 def _describe(items: list[Entry], key: str) -> dict[str, float | None]:
-    """Median, 95th percentile and maximum of the magnitudes, without None."""
+    """Returns the median, the 95th percentile and the maximum of the magnitudes of a value. Items
+    whose value is None are left out."""
     values = [abs(item[key]) for item in items if item[key] is not None]
     if not values:
         return {"median": None, "p95": None, "max": None}

@@ -64,7 +64,8 @@ class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
     ) -> None:
         """
         Args:
-            scenario: a scenario file, or the name of one of the project's; its policy is ignored.
+            scenario: a scenario file, or the name of a scenario file of the project. The scenario's
+                policy is ignored.
             scenario_name: the name of a scenario in the file; None for the first.
             scenario_text: YAML that is merged over the scenario.
             perturb: perturbations, as for `--perturb`.

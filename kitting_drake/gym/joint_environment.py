@@ -71,7 +71,7 @@ class JointEnvironment(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32
     ) -> None:
         """
         Args:
-            scenario: a scenario file, or the name of one of the project's.
+            scenario: a scenario file, or the name of a scenario file of the project.
             scenario_name: the name of a scenario in the file; None for the first.
             scenario_text: YAML that is merged over the scenario, such as `{robot: !FrankaArm {}}`.
             perturb: perturbations, as for `--perturb`.

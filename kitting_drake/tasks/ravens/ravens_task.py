@@ -70,9 +70,9 @@ class RavensTask(TaskConfig):
 class PoseTask(RavensTask):
     """A task whose objects must come to rest in given poses."""
 
-    # An object is in place if its horizontal distance from its goal is below the first threshold,
-    # in m, and the difference of headings, modulo the object's symmetry, is below the second, in
-    # degrees.
+    # An object is in place if its horizontal distance from its goal is below `position_threshold`,
+    # in m, and the difference of headings, modulo the object's symmetry, is below
+    # `angle_threshold_deg`, in degrees.
     position_threshold: float = bounded(0.01, 1e-4, 0.5)
     angle_threshold_deg: float = bounded(15.0, 0.1, 180.0)
 
