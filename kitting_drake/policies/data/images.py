@@ -20,7 +20,8 @@ Image = NDArray[np.float32]
 """(4, rows, cols): red, green, blue in [0, 1] and height in metres."""
 
 _CURVATURE_STD = 0.2
-"""The standard deviation of both coefficients of a random curvature (see `curved_crop`)."""
+"""The standard deviation of each of the two coefficients of a random curvature (see
+`curved_crop`)."""
 _FARTHEST_CURVED = 1.4
 """The distance from the pick beyond which the displacements of a curved crop stop growing, in half
 sides of the crop. The crop's corners are about this far from the pick."""
@@ -245,7 +246,8 @@ def reflect(sample: LabelledImage) -> LabelledImage:
     """Returns the mirror image of a sample, with reversed columns and the labels of the mirrored
     scene.
 
-    For networks that are not equivariant to reflections it is a new scene with new shapes.
+    For networks that are not equivariant to reflections, the mirror image is a new scene with new
+    shapes.
     """
     last = sample.image.shape[2] - 1
 

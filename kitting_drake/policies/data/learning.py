@@ -15,7 +15,7 @@ class Learning:
 
     later_picks_possible: bool = False
     """Whether objects can be picked in any order. Every later pick of a demonstration then also
-    labels its earlier observations. True for kitting, false for stacking."""
+    labels the demonstration's earlier observations. True for kitting, false for stacking."""
     curvature: bool = False
     """Whether objects may be bent in the image, as data augmentation for pick angles. This requires
     that the task's objects differ slightly in shape, and that a bent object is picked in the same

@@ -17,7 +17,7 @@ from systems.signals import Observation, PickPlaceAction, PlanarPose
 class Stored:
     """An array in a file, read whenever NumPy asks for it.
 
-    The file stays open, so replacing it does not affect the array.
+    The file stays open, so the array does not change if the file is replaced.
     """
 
     file: h5py.File

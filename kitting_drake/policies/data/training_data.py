@@ -88,8 +88,8 @@ class TrainingData:
 
     @property
     def unrelated(self) -> tuple[int, ...]:
-        """The positions at which the data can be split into unrelated parts, as numbers of items
-        before the split.
+        """Where the data can be split into unrelated parts: for each possible split, the number of
+        items before it.
 
         Static scenes share tools within a batch; demonstrations are independent.
         """
@@ -166,7 +166,7 @@ class TrainingData:
 
 def _alike(one: Any, other: Any) -> bool:
     """Whether two values of a scenario field can give the same scenes. Nested fields that only one
-    of them has are ignored, because older files lack some."""
+    of the values has are ignored, because older files lack some fields."""
     if not isinstance(one, Mapping) or not isinstance(other, Mapping):
         return bool(one == other)
     both = (one.keys() & other.keys()) - {*_NO_SCENE}
@@ -208,7 +208,7 @@ def read_training_data(path: Path) -> TrainingData:
         demonstrations: Demonstrations = read_demonstrations(path)
         origin = demonstrations.origin
         # The lowest height of a simulated scenario's grid may be below the table. In recordings
-        # from a real robot it is the table.
+        # from a real robot it is the table's height.
         z_min = (origin.scenario.get("heightmap") or {}).get("z_min", 0.0)
         if z_min != 0:
             raise UserError(

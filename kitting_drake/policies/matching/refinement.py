@@ -250,8 +250,8 @@ def refine_grasp(
     if failed is not None:
         near = untried(near, failed, resolution)
     least = min((grasp.cost for grasp in near), default=math.inf)
-    # The network takes more into account than the cost does, so keep its grasp unless another one
-    # costs much less.
+    # The network takes more into account than the cost does, so keep the network's grasp unless
+    # another grasp costs much less.
     same = min((g.cost for g in grasps if is_same(*away(g))), default=None)
     if same is not None and same < least + _MUCH_WORSE:
         return RefinedGrasp(pick, theta, same)

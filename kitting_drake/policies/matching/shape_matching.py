@@ -80,7 +80,8 @@ class ShapeMatchingPolicy:
     def _insert(
         self, inventory: Inventory, failed_picks: Sequence[PlanarPose]
     ) -> tuple[Matched | None, str]:
-        """Returns the best insertion and an empty string, or None and the reason."""
+        """Returns the best insertion and an empty string; if no insertion is possible, None and the
+        reason."""
         observation, segmentation = inventory.observation, inventory.segmentation
         failed = failed_pixels(observation.grid, failed_picks)
         resolution = observation.grid.resolution

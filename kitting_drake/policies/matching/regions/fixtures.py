@@ -150,7 +150,7 @@ def _find_fixture(
     height: NDArray[np.float32], relief: NDArray[np.float32], high: Mask, resolution: float
 ) -> Fixture | None:
     """Finds the largest plateau among the high pixels. Returns its convex hull and the plane of its
-    top, or None."""
+    top; None if there is no plateau."""
     least = AreaLimits.of(resolution).fixture
     if high.sum() * resolution**2 < least:
         return None

@@ -53,8 +53,8 @@ _LEAST_GAP = 0.003
 """Half the largest width, in metres, of the gap between an object and its recess, where this is
 more than `_GAP` pixels."""
 _FLAT = 0.0006
-"""The largest deviation, in metres, from a flat floor's median depth. If twice the noise is more,
-it is used instead."""
+"""The largest deviation, in metres, from a flat floor's median depth. Twice the noise is used
+instead if that is more."""
 _FLAT_SHARE = 0.7
 """The share of a flat floor that deviates by at most `_FLAT` is larger than this."""
 _BELOW_TOP = 0.001
@@ -113,9 +113,9 @@ class Segmentation:
     def free_recesses(self) -> tuple[Region, ...]:
         """The recesses that contain no object.
 
-        They are wide, are seen, and have a flat floor. In a filled recess either only the narrow
+        They are wide, are seen, and have a flat floor. A filled recess differs: only the narrow
         gaps around the object are deep enough to be seen, or the object's surface is not flat, or
-        most of it ends just below the fixture's top.
+        most of this surface ends just below the fixture's top.
         """
         return tuple(
             item
@@ -127,8 +127,8 @@ class Segmentation:
     def unfilled_recesses(self) -> tuple[Region, ...]:
         """The recesses into which an object might fit.
 
-        These are the `free_recesses` and the narrow recesses. If there is noise, they are all
-        recesses, because an object in a recess may then look like the recess's floor.
+        These are the `free_recesses` and the narrow recesses. If there is noise, all recesses are
+        included, because an object in a recess may then look like the recess's floor.
         """
         if self.noise > CLEAN:
             return self.recesses
@@ -141,7 +141,7 @@ class Segmentation:
     @property
     def occupied(self) -> Mask:
         """(rows, cols) mask of the pixels where no object can be laid down, because something is
-        there or they are not seen.
+        there or because no camera sees them.
 
         Single unseen pixels are ignored as noise.
         """
@@ -167,8 +167,8 @@ class Segmentation:
         """Whether a region is only a fragment of a filled recess.
 
         The larger part of the filled recess then shows the object's top, slightly below the
-        fixture's top. In a free recess, only slots whose floor no camera sees look so shallow, and
-        they are the smaller part.
+        fixture's top. In a free recess, only those slots look so shallow whose floor no camera
+        sees, and the slots are the smaller part.
         """
         if self.noise > CLEAN:
             return False

@@ -263,7 +263,8 @@ def frequencies_cutoff(in_fibre: Fibre, out_fibre: Fibre, size: int) -> float | 
 
     A kernel of angular frequency k maps rho_i to rho_j with j up to i + k. With escnn's own limit,
     the highest output frequencies may be unreachable and so always zero. The limit is then raised
-    to the value that they need on the outermost ring. Higher frequencies would alias there.
+    to the value that these frequencies need on the outermost ring. A larger limit would cause
+    aliasing there.
 
     Returns:
         The limit; None for escnn's own limit.
