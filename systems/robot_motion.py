@@ -38,7 +38,7 @@ class RobotMotion(Protocol):
         place by equivalent ones.
 
         Returns:
-            Whether the robot can reach pick and place. If it cannot, it must not move in
+            Whether the robot can reach pick and place. A robot that cannot must not move in
             `APPROACH`.
         """
 

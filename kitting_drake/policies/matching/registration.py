@@ -261,8 +261,8 @@ def _coarse_starts(outline: Outline, recess: Outline) -> list[tuple[float, Array
     lowest = (costs <= np.roll(costs, 1)) & (costs < np.roll(costs, -1))
     candidates = np.flatnonzero(lowest)
     if not len(candidates):
-        # The centroid of an L-shaped recess may lie so far outside it that a small object placed
-        # there does not overlap it.
+        # The centroid of an L-shaped recess may lie so far outside the recess that a small object
+        # placed there does not overlap the recess.
         candidates = np.array([costs.argmin()])
     best = candidates[np.argsort(costs[candidates])][:_STARTS]
     return [

@@ -222,10 +222,13 @@ class _DrawnKitting(KittingTask):
     def _shares(self, count: int, rng: np.random.Generator) -> list[tuple[int, ...]]:
         """Indices of the tools of each kit."""
         if count < self.kits:
-            raise UserError(f"task.kits is {self.kits}, but there are only {count} tools")
+            raise UserError(
+                f"task.kits is {self.kits}, but there are only {count} tools: give fewer kits"
+            )
         if count > MOST_TOOLS * self.kits:
             raise UserError(
-                f"task: {count} tools need more than {self.kits} kits of up to {MOST_TOOLS}"
+                f"task.kits is {self.kits}, but {count} tools need more kits, because a kit holds "
+                f"up to {MOST_TOOLS}"
             )
         if self.kits == 1:
             return [tuple(range(count))]
@@ -274,7 +277,7 @@ class _DrawnKitting(KittingTask):
         ):
             raise ValueError(
                 "task.kits, task.riser and task.tilt_deg can be set only if task.start is apart "
-                "and task.tray is false"
+                f"and task.tray is false, but they are {self.start} and {str(self.tray).lower()}"
             )
 
 

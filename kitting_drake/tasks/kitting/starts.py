@@ -140,7 +140,9 @@ def draw_unsettled(
     """
     drawn = _draw(kit, tools, kind, False, _Room(grid, spacing, math.pi), rng)
     if drawn is None:
-        raise UserError(f"task.start: there is no room for {len(tools)} tools")
+        raise UserError(
+            f"task.start: there is no room for {len(tools)} tools: name fewer or shorter tools"
+        )
     return drawn
 
 
@@ -153,7 +155,8 @@ def check_start(start: str, tray: bool, faces: str, distractors: int) -> None:
         raise ValueError("task.tray must be false if task.start is leaning")
     if distractors and (tray or start != APART):
         raise ValueError(
-            "task.distractors must be 0 unless task.start is apart and task.tray is false"
+            f"task.distractors must be 0, not {distractors}, unless task.start is apart and "
+            "task.tray is false"
         )
 
 

@@ -175,7 +175,8 @@ class AssemblingKits(PoseTask):
             if height - tool.height < wall - 1e-9:
                 raise UserError(
                     f"task.kit.height: '{tool.name}' is {1e3 * tool.height:.1f} mm high, so a "
-                    f"block of {1e3 * height:.1f} mm is too low"
+                    f"block of {1e3 * height:.1f} mm is too low: give at least "
+                    f"{tool.height + wall:.4g} m"
                 )
         drawn = draw_in_turn(range(len(tools)), draw, restarts=_RESTARTS)
         if drawn is None:

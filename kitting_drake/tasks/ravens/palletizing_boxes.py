@@ -55,7 +55,7 @@ _POINT_SPACING = 0.02
 class PalletizingBoxes(RavensTask):
     """Boxes that appear one at a time are stacked on a pallet.
 
-    The demonstrator fills one layer after the other, each in random order.
+    The demonstrator fills one layer after the other, and the places of a layer in random order.
     """
 
     causes = (NEVER_APPEARED, *RavensTask.causes)
