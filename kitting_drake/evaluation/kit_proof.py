@@ -27,7 +27,7 @@ _TIGHT = ("insertion blocked", "misplaced", _OFF)
 GOOD = 0.95
 """A kit fits if at least this share of the tools is kitted."""
 _CLEARLY = 3
-"""The least number of failures after which a kit may be given up."""
+"""The test of a clearance ends early only after at least this many failures."""
 _WIDER = (1.5, 2.25)
 """Clearances that are tried for a kit that does not fit, as multiples of the kit's own
 clearance."""
@@ -87,7 +87,7 @@ class _Outcome:
     pictures: list[bytes] = field(default_factory=list)
     """Pictures of the start and the end as PNG, if they were drawn."""
     failure: str | None = None
-    """Why the episode could not be run; None if it was."""
+    """Why the episode failed; None if it did not."""
 
 
 @dataclass
@@ -124,7 +124,7 @@ class KitProof:
         return proportion_interval(self.kitted, self.tried)[1] < GOOD
 
     def add(self, outcome: _Outcome) -> None:
-        """Counts an episode."""
+        """Adds the results of an episode."""
         self.episodes += 1
         self.pictures = self.pictures or outcome.pictures
         for item in outcome.tools:
@@ -162,7 +162,7 @@ def prove_kit(
         episodes: number of simulated episodes.
         progress: a function that is called before the first and after each episode.
         tools: names or folders of the tools to put into the cavities, one for each cavity; by
-            default those for which the cavities were made.
+            default the tools for which the cavities were made.
         workers: the number of processes that run episodes.
 
     Returns:
@@ -261,7 +261,7 @@ def _drawn_kit(seed: int, clearance_mm: float, clearance_of: Mapping[str, float]
 
 
 def _run_episode(folder: Path, seed: int, text: str) -> _Outcome:
-    """Runs one episode of a kit; the first one with pictures."""
+    """Runs one episode of a kit. The episode of seed 0 takes pictures."""
     try:
         chosen = find_scenario(folder / "scenario.yaml", None, text, None)
         diagram, station = build_chosen(chosen, seed=seed)

@@ -157,7 +157,7 @@ class _DrawnKitting(KittingTask):
         self, tools: list[Tool], grid: PixelGrid, seed: int, models: Sequence[Tool] = ()
     ) -> Scene:
         """Draws the scene of tools and their kits. The cavities are made for `models`, one for each
-        tool; if empty, for the tools themselves."""
+        tool; if `models` is empty, for the tools themselves."""
         tools = self.fitted(self._weighted(tools, seed))
         if self.start != APART or self.tray:
             return self._draw_settled(self.kit_of(tools), tools, grid, seed)
@@ -319,9 +319,15 @@ class Kitting(_DrawnKitting):
         super().validate()
         check_count(len(self.tools), self.kits)
         if self.cavities and len(self.cavities) != len(self.tools):
-            raise ValueError("task.cavities must name one tool for each of task.tools")
+            raise ValueError(
+                f"task.cavities must name one tool for each of the {len(self.tools)} in task.tools, "
+                f"but names {len(self.cavities)}"
+            )
         if self.cavities and (self.start != APART or self.tray):
-            raise ValueError("task.cavities can be set only if task.start is apart, without a tray")
+            raise ValueError(
+                "task.cavities can be set only if task.start is apart and task.tray is false, but "
+                f"they are {self.start} and {str(self.tray).lower()}"
+            )
 
 
 @dataclass
