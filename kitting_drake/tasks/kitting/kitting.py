@@ -320,8 +320,8 @@ class Kitting(_DrawnKitting):
         check_count(len(self.tools), self.kits)
         if self.cavities and len(self.cavities) != len(self.tools):
             raise ValueError(
-                f"task.cavities must name one tool for each of the {len(self.tools)} in task.tools, "
-                f"but names {len(self.cavities)}"
+                f"task.cavities names {len(self.cavities)} tools, but must name "
+                f"{len(self.tools)}, one for each of task.tools"
             )
         if self.cavities and (self.start != APART or self.tray):
             raise ValueError(
