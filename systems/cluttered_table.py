@@ -241,9 +241,9 @@ class ClutteredTable:
         """The gripper pose at which an object is released to lay it aside; None if there is no
         room.
 
-        The place is on a free part of the table. For an object that lies upside down or stands on
-        its edge, it is over an edge of the ledge instead: the object is released with its centre of
-        mass outside the edge, so that it turns over.
+        The place is on a free part of the table. An object that lies upside down or stands on its
+        edge is instead released over an edge of the ledge, with its centre of mass outside the
+        edge, so that it turns over.
         """
         item, X_WB = self.objects[index], poses[index]
         others = [other for k, other in enumerate(points) if k != index]

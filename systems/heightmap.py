@@ -174,7 +174,8 @@ def _see(view: View, grid: PixelGrid) -> NDArray[np.float32]:
     # +0.
     z = np.where((z < 0) & (z > -_ROUNDING), 0, z) + np.float32(0)
     # `_sortable` gives integers in the order of the heights. They become the upper bits of a key,
-    # and the point's index the lower ones. The maximum key then has the highest point's colour.
+    # and the point's index becomes the lower bits. The maximum key then has the highest point's
+    # colour.
     key = (_sortable(z).astype(np.int64) << 32) | point
     unseen = np.iinfo(np.int64).min
     highest = np.full(grid.rows * grid.cols, unseen, np.int64)

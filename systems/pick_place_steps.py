@@ -213,7 +213,7 @@ class PickPlaceSteps:
 
         Args:
             moment: the inputs, after the hand has rested.
-            lever: present result of `felt_lever`, in m.
+            lever: the result of `felt_lever` at this moment, in m.
             weight: the object's weight, in N.
         """
         state = moment.state

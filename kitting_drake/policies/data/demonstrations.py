@@ -329,8 +329,8 @@ def _read_group(group: h5py.Group, grid: PixelGrid) -> Demonstration:
 
 
 def _checked(group: h5py.Group, name: str, shape: tuple[int, ...], digest: Any) -> h5py.Dataset:
-    """Checks a dataset's shape and that its entries are finite, adds its content to a digest, and
-    returns it."""
+    """Returns a dataset after checking its shape and that its entries are finite. Adds the
+    dataset's content to a digest."""
     dataset = group[name]
     values = dataset[()]
     if values.shape != shape:
