@@ -218,7 +218,7 @@ def draw_color(observation: Observation) -> bytes:
 
 
 def draw_height(observation: Observation) -> bytes:
-    """Draws the heights of o_t as a PNG of (rows, cols), from black at the table to white."""
+    """Draws the heights of o_t as a PNG of (rows, cols): black is the table, white the highest."""
     height = observation.height
     top = max(float(np.percentile(height, 99.5)), _LEAST_RANGE)
     grey = np.rint(255 * np.clip(height / top, 0, 1)).astype(np.uint8)

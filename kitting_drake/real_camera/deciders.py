@@ -174,9 +174,9 @@ def load_policy(
     Args:
         weights: a file that `train` wrote; None for the generalist.
         orientations: the number N of orientations.
-        fit_outlines: True suits tasks with insertion: places are refined by outlines, and grasps by
-            the room that the jaws have. False chooses, among equivalent rotations of a place, a
-            rotation at which the fingers have room to open.
+        fit_outlines: whether the task is to insert objects. If so, places are refined by outlines,
+            and grasps by the clearance of the jaws. If not, the rotation of a place is chosen among
+            equivalent ones so that the fingers have room to open.
         recover: whether to correct failed insertions; see `Recovery`.
         parameters: the parameters of the robot's motion; None for the simulated cell's defaults.
             Give `decide` the same.

@@ -131,8 +131,8 @@ class Calibration:
     outline: TableOutline = dataclasses.field(default_factory=TableOutline)
     """The part of the workspace that is table."""
     verified: bool = False
-    """Whether x, y, yaw and the orientation of the image were checked. A bare table cannot show
-    their errors."""
+    """Whether x, y, yaw and the orientation of the image were checked. Images of a bare table do
+    not show errors in these."""
 
     @cached_property
     def region(self) -> NDArray[np.bool_] | None:
@@ -217,7 +217,7 @@ def _read_camera(
 ) -> BenchCamera:
     where = f"{path}: camera {name}"
     if not isinstance(node, dict):
-        raise UserError(f"{where} must be a mapping of fields")
+        raise UserError(f"{where} must be a mapping of fields, not {node!r}")
     known = (*POSE_FIELDS, *_DEPTH_FIELDS, "color", "topics", *beside)
     intrinsics = _read_lens(path, name, node, known, where)
     limits = {key: number(node[key], f"{where}: {key}") for key in _DEPTH_FIELDS if key in node}
@@ -274,7 +274,10 @@ def _read_lens_of_file(path: Path, name: str, node: dict[str, Any], where: str) 
     intrinsics = read_intrinsics(lens, f"{where}: {file}")
     if size not in (None, intrinsics.size):
         wide, high = intrinsics.size
-        raise UserError(f"{where}: resolution must be that of {file}, which is {wide}x{high}")
+        raise UserError(
+            f"{where}: resolution is {size}, but {file} is for images of {wide}x{high} pixels: "
+            "give this resolution, or another file"
+        )
     return intrinsics
 
 
@@ -305,17 +308,19 @@ def _read_color_lens(path: Path, name: str, node: Any, where: str) -> ColorLens:
 
 
 def _read_grid(path: Path, node: Any, table_height: float) -> PixelGrid:
-    if not isinstance(node, dict) or not set(node) <= set(_GRID_FIELDS):
+    if not isinstance(node, dict):
         fields = ", ".join(_GRID_FIELDS)
-        raise UserError(f"{path}: workspace may only have the fields {fields}")
+        raise UserError(f"{path}: workspace must be a mapping with {fields}, not {node!r}")
+    check_fields(node, _GRID_FIELDS, f"{path}: workspace")
     values: dict[str, Any] = {}
     for key, value in node.items():
         read = whole_number if key in ("rows", "cols") else number
         values[key] = read(value, f"{path}: workspace.{key}")
-    if values.get("rows", 1) * values.get("cols", 1) > _MOST_PIXELS:
+    rows, cols = (values.get(key, getattr(PixelGrid(), key)) for key in ("rows", "cols"))
+    if rows * cols > _MOST_PIXELS:
         raise UserError(
-            f"{path}: workspace has {values['rows']} x {values['cols']} pixels, more than "
-            f"{_MOST_PIXELS:.0e}: give the resolution in metres"
+            f"{path}: workspace has {rows} x {cols} pixels, more than {_MOST_PIXELS}: give the "
+            "resolution in metres, and fewer rows and cols"
         )
     top = table_height + values.pop("max_height", _HEIGHT)
     try:

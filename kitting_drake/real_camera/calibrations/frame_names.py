@@ -91,9 +91,9 @@ def directed(found: FoundPose, names: FrameNames) -> FoundPose:
         found, kinds = found.inverse, (kinds[1], CAMERA)
     if kinds[1] != CAMERA or kinds[0] not in (BASE, HAND):
         raise UserError(
-            f"{found.where} is a transform of {found.child} in {found.parent}, and it is not "
-            "clear which is the robot's base and which the camera: give base_frame and "
-            "camera_frame beside it"
+            f"{found.where} is the pose of {found.child} in {found.parent}, and it is not clear "
+            "which of these frames is the robot's base and which is the camera: give base_frame "
+            "and camera_frame beside it"
         )
     return FoundPose(found.X, found.where, found.parent, found.child, kinds[0] == HAND)
 

@@ -30,8 +30,8 @@ def with_chained_poses(entries: dict[str, Any], path: Path) -> dict[str, Any]:
         path: the calibration's file.
 
     Raises:
-        UserError: the chain is broken, or several of its cameras have poses, which could contradict
-            each other.
+        UserError: a camera of the chain lacks its transform from the previous camera, or several
+            cameras of the chain have poses, which could contradict each other.
     """
     lacking = [
         name

@@ -102,8 +102,10 @@ def kalibr_cameras(content: dict[str, Any]) -> dict[str, dict[str, Any]]:
 def kalibr_stream(cameras: dict[str, dict[str, Any]], where: str, stream: str) -> str:
     """Returns the kalibr camera whose name is `stream`, or whose topic contains `stream`.
 
+    If there is only one camera, it is returned in any case.
+
     Raises:
-        UserError: no camera matches, or several do.
+        UserError: there are several cameras, and none or more than one of them matches.
     """
     if stream in cameras:
         return stream

@@ -92,7 +92,10 @@ def rotation_of_quaternion(xyzw: Array, where: str, tolerance: float = _ORTHOGON
         UserError: the length of the quaternion is not 1.
     """
     if abs(np.linalg.norm(xyzw) - 1) > tolerance:
-        raise UserError(f"{where} must be a unit quaternion x, y, z, w")
+        length = np.linalg.norm(xyzw)
+        raise UserError(
+            f"{where} must be a unit quaternion x, y, z, w, but its length is {length:.4g}"
+        )
     return np.asarray(Rotation.from_quat(xyzw).as_matrix(), dtype=float)
 
 

@@ -19,8 +19,11 @@ class _Loader(yaml.SafeLoader):
     """A loader of YAML with `cv2.FileStorage` matrices, for which repeated fields are errors."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        """Returns the mapping of a node; PyYAML itself would silently keep the last of repeated
-        fields."""
+        """Returns the mapping of a node.
+
+        Raises:
+            ConstructorError: a field is repeated. PyYAML itself would silently keep the last one.
+        """
         pairs = node.value if isinstance(node, yaml.MappingNode) else []
         fields = [key.value for key, _ in pairs if isinstance(key, yaml.ScalarNode)]
         repeated = next((name for name in fields if fields.count(name) > 1), None)

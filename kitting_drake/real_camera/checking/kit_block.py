@@ -80,7 +80,7 @@ def see_block(
         noise: the standard deviation of the heights, in metres.
 
     Raises:
-        UserError: the camera does not see the block, or another block.
+        UserError: the camera does not see the block, or it sees a block of another size.
     """
     z = np.where(np.isfinite(points[..., 2]), points[..., 2] - table, -1.0)
     if noise > _CLEAN:

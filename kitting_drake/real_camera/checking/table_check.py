@@ -224,7 +224,7 @@ def _suppositions(
         _as_depth(camera, depth),
     )
     yield (
-        "its inverse would agree: is it the pose of the base in the camera?",
+        "the inverse of the pose would agree: is it the pose of the base in the camera?",
         camera,
         np.asarray(np.linalg.inv(X)),
         depth,
@@ -232,7 +232,8 @@ def _suppositions(
     body = np.eye(4)
     body[:3, :3] = Rotation.from_euler("xyz", [-90, 0, -90], degrees=True).as_matrix()
     yield (
-        "it would agree if this were the pose of ROS's body frame: give that of the optical frame",
+        "the pose would agree if it were that of ROS's body frame (x forward): give that of the "
+        "optical frame (z forward)",
         camera,
         X @ body,
         depth,
@@ -265,4 +266,9 @@ def _suppositions(
     for axis, name in ((0, "x"), (1, "y")):
         turned = X.copy()
         turned[:3, :3] = np.diag([-1.0 if k != axis else 1.0 for k in range(3)]) @ X[:3, :3]
-        yield f"its rotation by half a turn about base {name} would agree", camera, turned, depth
+        yield (
+            f"the pose rotated by half a turn about base {name} would agree",
+            camera,
+            turned,
+            depth,
+        )

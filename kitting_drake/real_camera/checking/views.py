@@ -139,10 +139,10 @@ def _check_pose(camera: BenchCamera, grid: PixelGrid) -> None:
         return
     inverse: NDArray[np.float64] = np.asarray(np.linalg.inv(X_BC), dtype=float)
     others = {
-        "its inverse would: is it the pose of the base in the camera?": inverse,
-        "it would if this were the pose of ROS's body frame: give that of the optical frame, z "
-        "forward": X_BC @ _OPTICAL,
-        "it would if the pose were in millimetres: positions are in metres": np.vstack(
+        "the inverse of the pose would see it: is it the pose of the base in the camera?": inverse,
+        "it would be seen if the pose were that of ROS's body frame (x forward): give that of the "
+        "optical frame (z forward)": X_BC @ _OPTICAL,
+        "it would be seen if the pose were in millimetres: give positions in metres": np.vstack(
             [np.column_stack([X_BC[:3, :3], X_BC[:3, 3] / 1e3]), X_BC[3:]]
         ),
     }

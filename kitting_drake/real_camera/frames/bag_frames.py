@@ -124,9 +124,15 @@ def _first_pair(
 def _settled(
     colors: list[RecordedMessage], depths: list[RecordedMessage], ended: bool
 ) -> tuple[RecordedMessage, RecordedMessage] | None:
-    """Returns a pair of images as soon as no later colour image can be closer in time.
+    """Returns the first pair of images, if no later colour image can be closer to its depth image
+    in time; else None.
 
-    Removes from both lists the images that cannot belong to a pair.
+    Images that cannot belong to a pair are removed from the lists.
+
+    Args:
+        colors: the colour images so far, in the order of recording.
+        depths: the depth images so far, in the order of recording.
+        ended: whether the recording has no further images.
     """
     while depths and colors:
         first = depths[0]
@@ -156,7 +162,7 @@ def _check_registered(
         raise UserError(
             f"{path}: {depth.topic} is in the frame {frames[1]}, and {color.topic} in {frames[0]}: "
             "record depth that is registered to colour (aligned_depth_to_color), or describe the "
-            "colour's lens by color: in the calibration"
+            "colour's lens under 'color' in the calibration"
         )
 
 

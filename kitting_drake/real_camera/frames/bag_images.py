@@ -56,14 +56,16 @@ def depth_of_message(body: Any, where: str) -> NDArray[Any]:
         return _pixels(body, np.dtype(_DEPTHS[body.encoding]), 1, where)[:, :, 0]
     data = bytes(body.data)
     if "32FC1" in body.format:
-        raise UserError(f"{where} is compressed with rounded floats: record the Image instead")
+        raise UserError(
+            f"{where} has floats that were rounded by compression: record the Image instead"
+        )
     # A compressed depth image has a header of twelve bytes before the PNG.
     start = data.find(_PNG, 0, 16)
     if start < 0:
         raise UserError(f"{where} is compressed as {body.format}: depth must be a PNG of 16UC1")
     with _decoded(data[start:], where) as image:
         if not image.mode.startswith("I"):
-            raise UserError(f"{where} is compressed to 8 bits: depth must have 16")
+            raise UserError(f"{where} is compressed to 8 bits: depth must have 16 bits")
         return np.asarray(image)
 
 

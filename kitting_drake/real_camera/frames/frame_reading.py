@@ -102,10 +102,16 @@ def read_frames(
 
 
 def find_color(folders: Sequence[Path], name: str, alone: bool) -> Path:
-    """Returns the colour image of a camera in folders.
+    """Returns the path of a camera's colour image.
+
+    Args:
+        folders: the folders to search.
+        name: the camera's name.
+        alone: whether the calibration has only this camera, so that the name of a file may lack the
+            camera's name.
 
     Raises:
-        UserError: there is no such image, or several.
+        UserError: there is no such image, or there are several.
     """
     return _only(_candidates(folders, name, alone, COLOUR_NAMES, COLOUR_ENDINGS), folders, name, 0)
 
@@ -138,7 +144,7 @@ def _frame(
 ) -> Frame:
     """Checks the sizes of colour and depth, and registers colour to depth."""
     if camera.color is None:
-        advice = ": if colour has a lens of its own, describe it by color: in the calibration"
+        advice = ": if colour has a lens of its own, describe it under 'color' in the calibration"
         check_size(color.shape, camera.intrinsics, camera, named[0], advice)
     else:
         check_size(color.shape, camera.color.intrinsics, camera, named[0])

@@ -28,7 +28,9 @@ _METRES = 50.0
 def read_cloud(
     path: Path, camera: BenchCamera
 ) -> tuple[NDArray[np.uint8] | None, NDArray[np.float32]]:
-    """Reads a point cloud as images: colour (height, width, 3), or None, and depth (height, width).
+    """Reads a point cloud as images: colour (height, width, 3) and depth (height, width) in metres.
+
+    The colour is None if the cloud has no colours.
 
     The points must be in the camera's optical frame (x right, y down, z forward), in metres. If a
     cloud has one point for each pixel, in rows, its points become the pixels. The points of any
@@ -98,7 +100,10 @@ def _rendered(
             np.abs(row - height / 2 + 0.5) < height / 2
         )
     if not inside.any():
-        raise UserError(f"camera {camera.name} would see no point of its cloud: check its pose")
+        raise UserError(
+            f"no point of the cloud of camera {camera.name} is in its view: save the cloud in the "
+            "camera's optical frame, and check the intrinsics"
+        )
     cells = np.rint(row[inside]).astype(int), np.rint(col[inside]).astype(int)
     # In each pixel the last assignment counts, which is that of the nearest point.
     order = np.argsort(-points[inside, 2], kind="stable")

@@ -25,7 +25,7 @@ corners are poor."""
 _SAME = math.radians(1)
 """The angle in radians below which two poses count as the same."""
 _CLEARER = 16.0
-"""The pose is ambiguous if the sum of the corners' squared errors at another pose is larger by less
+"""A pose is ambiguous if, at another pose, the sum of the corners' squared errors is larger by less
 than this multiple of a corner's variance."""
 _LIKELY = 0.2
 """The error of corners that is expected in a real image, in pixels."""

@@ -214,7 +214,7 @@ def test_colour_of_another_lens_is_registered(tmp_path: Path):
     assert columns.tolist() == [0, 2, 4, 6, 8, 10, 12, 14]
     np.testing.assert_array_equal(frame.color[3, :, 0], 10 + 16 * columns)
     assert not frame.color[0, 3].any()
-    with pytest.raises(UserError, match=r"color.png is 16x12 pixels.*describe it by color:"):
+    with pytest.raises(UserError, match=r"color.png is 16x12 pixels.*describe it under .color."):
         read(tmp_path)
 
 
