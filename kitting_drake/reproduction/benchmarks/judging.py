@@ -67,7 +67,7 @@ def covering(action: PickPlaceAction, loose: Sequence[LooseTool]) -> list[Planar
 
 
 def _picked(action: PickPlaceAction, loose: Sequence[LooseTool]) -> LooseTool | None:
-    """Returns the tool of which the largest part lies between the open jaws; None without one."""
+    """Returns the tool with the largest part between the open jaws; None if no tool is there."""
     pick = action.pick
     between = rectangle_at((PAD_LENGTH, MAX_OPENING), pick.x, pick.y, pick.theta)
     held = [(between ^ _placed(item.tool.footprint, item.X_WT)).area() for item in loose]

@@ -32,7 +32,8 @@ _SPACING, _COARSE = 0.025, 0.10
 _AROUND = 0.8
 """The largest distance of a searched base from the workspace, in m."""
 _STEP, _FINER = 0.10, 0.05
-"""The spacing of the bases in the first search, and around its best bases in the second, in m."""
+"""The spacing of the bases in the first search, and in the second search, in m. The second search is
+around the best bases of the first."""
 _TURNS = (0.0, -45.0, 45.0, 180.0)
 """The yaws of the base to try, relative to the yaw at which it faces the workspace, in degrees."""
 
@@ -133,12 +134,12 @@ def _search(
         for dx in (-_FINER, 0.0, _FINER)
         for dy in (-_FINER, 0.0, _FINER)
     ]
-    candidates = [base for base in dict.fromkeys([*around, given]) if _is_free(base, grid)]
+    candidates = [base for base in dict.fromkeys([*around, given]) if _is_outside(base, grid)]
     exact = [_Best(score(base, fine), base) for base in candidates]
     return tried, max(exact, key=order)
 
 
-def _is_free(base: ArmBase, grid: PixelGrid) -> bool:
+def _is_outside(base: ArmBase, grid: PixelGrid) -> bool:
     """Whether the arm's foot stands outside the workspace."""
     dx = max(grid.x_min - base.x, base.x - grid.x_max, 0.0)
     dy = max(grid.y_min - base.y, base.y - grid.y_max, 0.0)
@@ -159,7 +160,7 @@ def _bases(given: ArmBase, grid: PixelGrid) -> list[ArmBase]:
             facing = 45 * round(math.degrees(math.atan2(middle[1] - y, middle[0] - x)) / 45)
             turned = (math.remainder(facing + turn, 360.0) for turn in _TURNS)
             found += [ArmBase(x, y, given.z, math.radians(yaw)) for yaw in turned]
-    return [base for base in found if _is_free(base, grid)]
+    return [base for base in found if _is_outside(base, grid)]
 
 
 def reach_table(measured: dict[str, Any]) -> Table:

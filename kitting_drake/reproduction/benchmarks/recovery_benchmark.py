@@ -158,7 +158,7 @@ class _Adversary:
         self.touched |= seated & {wanted}
 
     def _move(self, root_context: Context) -> None:
-        """Moves the object to a free place on the table."""
+        """Moves the victim to another place on the table; clears `victim` if there is no room."""
         station, rng = self._station, self._rng
         if self.victim is None:
             return

@@ -168,7 +168,7 @@ def _verdict(placement: Placement) -> dict[str, Any]:
 
 
 def _fall(mujoco: Any, release: Release) -> RigidTransform:
-    """Returns X_WB of a released tool at rest in MuJoCo."""
+    """Lets a released tool fall in MuJoCo; returns its pose X_WB at rest."""
     scene = release.station.scene
     item = scene.objects[release.index]
     world = mujoco.MjSpec()

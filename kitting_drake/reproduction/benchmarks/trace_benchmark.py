@@ -108,9 +108,16 @@ def benchmark_trace(
 def drawn_case(
     name: str, index: int, k: int, exif: bool, seed: int = 0
 ) -> tuple[PhotoSpec, PlacedTool]:
-    """Draws the conditions of the k-th photo of a tool.
+    """Draws the conditions of a photo of a tool at random, and places the tool on the sheet.
 
     All photos together cover three heights and tilts, both backgrounds, and light from all sides.
+
+    Args:
+        name: the name of the tool.
+        index: the number of the photo among all photos.
+        k: the number of the photo among the tool's photos, from 0 to 2; it gives the height.
+        exif: whether the photo states its focal length.
+        seed: the seed of the photos.
     """
     index += _SEEDS_APART * seed
     rng = np.random.default_rng(1000 + index)
@@ -180,7 +187,7 @@ def _turned(points: Points, angle: float) -> Points:
 
 
 def _registered(points: Points, target: Points) -> Points:
-    """Moves points (n, 2) rigidly onto a target, by their nearest neighbours."""
+    """Moves points (n, 2) rigidly onto target points, by iterative closest points (ICP)."""
     tree = cKDTree(target)
     for _ in range(25):
         _, nearest = tree.query(points)

@@ -63,7 +63,7 @@ class PhotoSpec:
     light: tuple[float, float] = (0.7, 0.4)
     """The shift of a shadow along x and y per unit of height."""
     softness: float = 0.15
-    """The spread of `light`, which makes shadows soft."""
+    """The standard deviation of `light` among the lamps, which makes shadows soft."""
     falloff: float = 0.25
     """The loss of light from one side of the sheet to the other."""
     blur: float = 1.0

@@ -32,11 +32,11 @@ def measure_folding(setup: SpeedSetup) -> dict[str, Any]:
     Returns:
         - `rungs`: the time of each of `MEASURES`, for each variant;
         - `speed_up`: the speed of each variant relative to plain escnn in float32;
-        - `convolution_share`: for the variants of this package, the share of the time of a training
-          step and of a decision that plain torch needs for convolutions of the same shapes and
-          type;
-        - `alpha_difference`: the difference of alpha's output from plain escnn's, relative to its
-          standard deviation;
+        - `convolution_share`: for the variants of this package, the time that plain torch needs for
+          convolutions of the same shapes and type, as a share of the time of a training step and of
+          a decision;
+        - `alpha_difference`: the standard deviation of the difference between alpha's output and
+          that of plain escnn, relative to the standard deviation of the latter;
         - `alpha_operations`: the operations of one inference of alpha.
     """
     ways = _ways(setup)
@@ -101,7 +101,7 @@ def _ways(setup: SpeedSetup) -> dict[str, tuple[Networks, Networks]]:
 
 
 def _with_autocast(escnn: Networks, type_: torch.dtype) -> Networks:
-    """Returns a copy that computes in a given type with torch's automatic mixed precision."""
+    """Returns a copy of networks that computes in a given type with torch's autocast."""
     escnn = copy.deepcopy(escnn)
     for network in escnn.children():
         if isinstance(network, EscnnUNet | EscnnAngleNet):
@@ -150,7 +150,7 @@ def _alpha(networks: Networks, setup: SpeedSetup) -> tuple[nn.Module, Tensor]:
 
 
 def computing_in(networks: Networks, type_: torch.dtype) -> Networks:
-    """Returns a copy for training that computes in another type."""
+    """Returns a copy of networks, for training, that computes in a given type."""
     networks = copy.deepcopy(networks)
     networks.compute_type = type_
     return networks

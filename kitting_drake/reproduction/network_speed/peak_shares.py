@@ -125,7 +125,7 @@ class _UNetWatch:
         self.layers: dict[str, list[str]] = {
             level: [] for level in ("input", *self._blocks.values(), "head")
         }
-        """The convolutions of each level."""
+        """The names of the convolutions of each level."""
         for name, module in network.named_modules():
             if isinstance(module, PlainConv2d):
                 block = ".".join(name.split(".")[:2])

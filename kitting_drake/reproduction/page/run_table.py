@@ -31,7 +31,7 @@ _LONG = ("categories", "outcomes", "resolved_scenario")
 
 
 def read_summaries(folder: Path) -> dict[str, Summary]:
-    """Returns the summaries of all runs, by name; none without files.
+    """Returns the summaries of all runs, by name; empty if there are no files.
 
     Raises:
         UserError: a file is damaged, or the two files do not have the same runs.

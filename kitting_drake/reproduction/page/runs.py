@@ -56,7 +56,7 @@ _ADDED: dict[str, Any] = {
 """Fields that the summaries of older versions lack, with the values that those versions used."""
 
 _ADDED_WHOLE = ("sensor_noise", "appearance")
-"""Fields that the summaries of older versions lack, and that have the scenario's defaults."""
+"""Fields that the summaries of older versions lack. Those versions used the defaults."""
 
 _HAND = (
     "planner.firm_grasp_force",

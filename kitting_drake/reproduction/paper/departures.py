@@ -18,7 +18,7 @@ _NOT_MEASURED = (
     ("arm", "an arm", "the hand alone, moving in x, y, z and yaw faster than an arm could"),
     ("rim of a cavity", "not given", "a lead-in bevel of 1 mm"),
     ("friction of a kit", "not given", "0.3"),
-    ("scenes", "not given", "drawn until the open hand is free at every annotated grasp"),
+    ("scenes", "not given", "drawn until the open hand has room at every annotated grasp"),
     ("release, in cells marked `e`", "the jaws open by 5 mm in all", "each jaw opens by 6 mm"),
     ("open jaws, place red in green, cells marked `e`", "50 mm apart", "80 mm apart"),
     ("demonstrated picks, in cells marked `e`", "off the middle along one axis", "at the middle"),

@@ -18,7 +18,7 @@ EFFICIENCY = "networks.json"
 
 
 def read_efficiency(folder: Path) -> dict[str, Any] | None:
-    """Reads the measurements of `benchmark networks`; returns None without a file.
+    """Reads the measurements of `benchmark networks`; returns None if there is no file.
 
     Raises:
         UserError: the file is damaged.

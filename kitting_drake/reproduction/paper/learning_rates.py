@@ -18,7 +18,7 @@ loss in nats on a Ravens task. It is infinite (null in the file) if training div
 
 
 def read_rates(folder: Path) -> dict[str, dict[str, float]]:
-    """Returns the learning rates that have been tried; none without a file.
+    """Returns the costs of the learning rates that have been tried; empty if there is no file.
 
     Raises:
         UserError: the file is damaged.

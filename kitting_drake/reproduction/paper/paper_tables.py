@@ -123,7 +123,8 @@ def headline(task: str, method: str, seed: int) -> Cell:
 
 
 def _headline_seeds() -> list[Cell]:
-    """Returns the cells of all seeds but the first, whose cells belong to figure 6."""
+    """Returns the cells of `HEADLINE_SEEDS` except those of the first seed, which are in figure
+    6."""
     return [
         headline(task, method, seed)
         for seed in HEADLINE_SEEDS[1:]

@@ -108,7 +108,8 @@ def _baselines() -> list[Training]:
 
 
 def _trainings(results: Mapping[str, Result], again: Collection[str]) -> list[str]:
-    """Writes the variation between trainings; empty without a second training."""
+    """Writes the section on the variation between trainings; it is empty if no cell was trained
+    twice."""
     rows = []
     for task in FIGURE_6:
         for method in LEARNED[:2]:

@@ -108,8 +108,8 @@ class Queue:
         return [cell for cell in cells if cell.name not in kept]
 
     def collect(self, task: Task, *, validation: bool) -> Path:
-        """Returns the file of a task's demonstrations, for training or validation; collects missing
-        ones."""
+        """Collects the missing demonstrations of a task, for training or validation; returns their
+        file."""
         count = task.validation if validation else self._wanted.get(task.name, task.demonstrations)
         folder = self.folder / "demonstrations" / f"{task.name}{'_validation' * validation}"
         if folder not in self._collected:
@@ -139,7 +139,7 @@ class Queue:
             yield reference(policy)
 
     def train(self, training: Training) -> Path:
-        """Returns the weights file of a training; trains if it is missing."""
+        """Trains, unless this was done before; returns the weights file."""
         rate = training.learning_rate or LEARNING_RATES[0]
         if _is_rate_chosen(training):
             rate = self._best_rate(reference(training))

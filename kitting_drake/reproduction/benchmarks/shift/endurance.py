@@ -39,7 +39,7 @@ HOUR = 3600.0
 OFF_TABLE = "off the table"
 _LINES = "scenes.jsonl"
 _MOST_LOST = 20
-"""The number of scenes in a row that cannot begin, after which the shift is aborted."""
+"""The shift is aborted after this number of scenes in a row that could not begin."""
 _BELOW = 0.05
 """The depth of an object's origin below the table's top, in m, at which it has fallen off the
 table."""
@@ -69,7 +69,7 @@ class ShiftScene:
     commit: str | None = None
 
     def cycles(self) -> list[float]:
-        """The time of each unit's cycle, in s."""
+        """Returns the time of each unit's cycle, in s."""
         return np.diff(self.unit_seconds, prepend=0.0).tolist()
 
 
