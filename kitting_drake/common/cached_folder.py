@@ -30,7 +30,7 @@ def cached_folder(final: Path, files: Sequence[str], write: Callable[[Path], obj
     Args:
         final: the folder. Its name must identify its content.
         files: the names of the files in the folder.
-        write: writes the files into an empty folder.
+        write: a function that writes the files into the empty folder that it gets.
 
     Raises:
         MachineError: the cache is not writable.
@@ -68,7 +68,7 @@ def prune(parent: Path) -> None:
     """Removes the least recently used folders in `parent`.
 
     It keeps the newest `KEPT_ENTRIES` folders, and all that are younger than `YOUNGEST_REMOVED`.
-    Scratch folders of killed processes are removed at the same age.
+    Scratch folders of killed processes are removed if they are older than `YOUNGEST_REMOVED`.
     """
     entries: list[tuple[float, Path]] = []
     for path in parent.iterdir():

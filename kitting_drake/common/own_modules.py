@@ -16,7 +16,8 @@ from kitting_drake.common.provenance import source_digest
 def modules_beside(base: Path) -> Iterator[None]:
     """Appends a folder to Python's module path for the duration of a `with` block.
 
-    As usual in Python, a module that was imported before under the same name is used again.
+    As usual in Python, a module is not imported again if a module of its name was imported
+    before.
 
     Args:
         base: the folder of the scenario's file.
@@ -73,8 +74,8 @@ def own_digest(module: str, base: Path) -> str:
 
 
 def files_beside(module: str, base: Path) -> list[Path]:
-    """The files of a module, or of its package, if it is in the folder of the scenario's file; else
-    an empty list.
+    """The files of a module, or of its package, in the folder of the scenario's file; empty if the
+    module is elsewhere.
 
     Args:
         module: name of the module.

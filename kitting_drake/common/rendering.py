@@ -83,7 +83,7 @@ def _load_triton() -> None:
 
 
 def add_observation_renderer(scene_graph: SceneGraph, lights: Sequence[LightParameter] = ()) -> str:
-    """Adds the engine of the policy's cameras, which is plain and fast. Returns its name.
+    """Adds the render engine of the policy's cameras, which is plain and fast. Returns its name.
 
     Args:
         scene_graph: the scene graph to which the engine is added.
@@ -99,11 +99,11 @@ def add_observation_renderer(scene_graph: SceneGraph, lights: Sequence[LightPara
 
 
 def add_picture_renderer(scene_graph: SceneGraph) -> str:
-    """Adds the engine for still pictures, with soft light from three sides and ambient occlusion.
-    Returns its name.
+    """Adds the render engine for still pictures, with soft light from three sides and ambient
+    occlusion. Returns its name.
 
-    Call this function before a context is made, because engines that are added later do not receive
-    poses.
+    Call this function before a context is made. An engine that is added later does not get the
+    poses of the geometry.
 
     Raises:
         MachineError: this machine cannot render.
@@ -112,7 +112,7 @@ def add_picture_renderer(scene_graph: SceneGraph) -> str:
 
 
 def add_film_renderer(scene_graph: SceneGraph) -> str:
-    """Adds the engine for videos, which is fast and lit like still pictures. Returns its name.
+    """Adds the render engine for videos, fast and with the light of pictures. Returns its name.
 
     Raises:
         MachineError: this machine cannot render.
@@ -176,7 +176,7 @@ def render_picture(
 ) -> NDArray[np.uint8]:
     """Renders a picture (800, 1280, 3) of a scene graph in its context, from a camera pose.
 
-    The scene graph needs the engine of `add_picture_renderer`.
+    The scene graph must have the render engine of `add_picture_renderer`.
     """
     camera = ColorRenderCamera(picture_camera("picture"))
     query = scene_graph.get_query_output_port().Eval(context)
