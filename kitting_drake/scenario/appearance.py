@@ -61,8 +61,8 @@ class Appearance:
     # The lights. If there are none, a light is at each camera.
     lights: list[Light] = dc.field(default_factory=list)
 
-    # If given, one to three random lights replace the lights above. Their total brightness is
-    # between 1 - value and 1 + value times the normal one.
+    # If given, one to three random lights replace the lights above. Their total brightness is the
+    # normal brightness times a random factor between 1 - value and 1 + value.
     drawn_lights: float | None = bounded(None, 0.0, 1.0)
 
     def validate(self) -> None:

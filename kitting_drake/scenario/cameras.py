@@ -135,7 +135,7 @@ def camera_pose(camera: Camera) -> RigidTransform:
 
 
 def depth_camera(camera: Camera, renderer: str) -> DepthRenderCamera:
-    """Drake's description of a camera; its colour camera has the same pose.
+    """Drake's depth camera for a camera of a scenario. The colour camera has the same pose.
 
     Args:
         camera: the camera of a scenario.

@@ -209,7 +209,10 @@ def _check_meaning(scenario: Scenario) -> None:
             f"could be a calibration error: use 0, or -{_PLAINLY_BELOW:g} or less"
         )
     if scenario.heightmap.z_max <= scenario.heightmap.z_min:
-        raise ValueError("heightmap.z_max must be above heightmap.z_min")
+        raise ValueError(
+            f"heightmap.z_max is {scenario.heightmap.z_max:g}, but must be above heightmap.z_min, "
+            f"which is {scenario.heightmap.z_min:g}"
+        )
     scenario.robot.validate(scenario.heightmap.grid())
     scenario.task.validate()
     scenario.appearance.validate()
@@ -232,7 +235,10 @@ def _check_meaning(scenario: Scenario) -> None:
             f"least {lowest:g} (heightmap.z_max + planner.travel_clearance)"
         )
     if planner.grasp_depth > planner.max_grasp_depth:
-        raise ValueError("planner.grasp_depth must be at most planner.max_grasp_depth")
+        raise ValueError(
+            f"planner.grasp_depth is {planner.grasp_depth:g}, but must be at most "
+            f"planner.max_grasp_depth, which is {planner.max_grasp_depth:g}"
+        )
     limit = scenario.controller.finger_force_limit
     for name in ("grasp_force", "firm_grasp_force"):
         force = getattr(planner, name)

@@ -17,7 +17,7 @@ _CLASS = "class"
 
 
 def is_own_task(raw: Any, current: Task) -> bool:
-    """Whether a scenario's `task:` is a `!PythonTask` or merges over one."""
+    """Whether a scenario's `task:` is a `!PythonTask`, or is merged over one."""
     if not isinstance(raw, dict):
         return False
     tag = raw.get("_tag")

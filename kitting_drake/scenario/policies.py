@@ -43,7 +43,7 @@ _TOLD = (
     "rigid",
     "rotations",
 )
-"""Fields of a weights file's card that are reported with the results."""
+"""Fields of the card (the metadata) of a weights file that are reported with the results."""
 
 
 @dataclass(frozen=True)
@@ -182,7 +182,7 @@ class Learned(PolicyConfig):
     # paper's policy has none of these refinements:
     # - The place: fit the object's outline to that of the recess, if the two agree.
     # - The pick: move the grasp to where the jaws have clearance.
-    # - Touching objects: separate them by the outlines of the free recesses.
+    # - Touching objects: separate them by the outlines of the empty recesses.
     # - Stopping: continue while an object fits into a recess, or an untried object may fit.
     # - In tasks without insertion: among rotations that score equally well, choose one with
     #   clearance for the opening fingers.
@@ -194,8 +194,8 @@ class Learned(PolicyConfig):
     # Whether to recover from failed insertions and to take heaps apart. The policy first presses
     # down protruding objects, then picks objects that fit into a recess, then lays objects that lie
     # on others on the table, and at last takes out objects that could not be pressed down, to try
-    # them again. Each object is moved in vain only once. This needs extra actions: see the task's
-    # `tries`.
+    # them again. An object that was taken out once is not taken out again. Recovery needs extra
+    # actions: see the task's `tries`.
     recover: bool = False
 
     def make_system(self, site: PolicySite) -> LeafSystem:

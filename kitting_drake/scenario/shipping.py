@@ -18,8 +18,8 @@ from kitting_drake.scenario.choosing import ChosenScenario
 _PACKAGES = ("kitting_drake", "systems")
 
 _FILES = Path("files")
-"""Subfolder with links to the scenario's files. The links have the files' absolute paths on this
-machine."""
+"""The subfolder with links to the scenario's files. The path of a link in it is the absolute path
+of the file on this machine."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,7 +111,7 @@ def _own_modules(modules: Iterable[str]) -> list[Path]:
 def _relative(value: Any, base: Path, places: set[Path]) -> Any:
     """Copies a value and makes every path to one of `places` relative to `base`.
 
-    Absolute paths would not be valid on the node, and Ray resolves symbolic links.
+    Absolute paths would not be valid on the node.
     """
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = {
