@@ -56,7 +56,7 @@ def hidden_table_note(scenario: Scenario) -> str | None:
 
 
 def _waiting_hand(home: tuple[float, float, float], along_y: list[float]) -> NDArray[np.float64]:
-    """(n, 3) points of boxes around the hand, at all waiting positions, in the world, in metres.
+    """Returns points (n, 3) of boxes around the waiting hand, in the world, in metres.
 
     Args:
         home: x, z and yaw of the home pose, in m and rad.
@@ -74,14 +74,14 @@ def _waiting_hand(home: tuple[float, float, float], along_y: list[float]) -> NDA
 
 
 def _box(size: tuple[float, float], low: float, high: float) -> NDArray[np.float64]:
-    """(n, 3) points of a box between two heights, around the z axis, in m."""
+    """Returns points (n, 3) of a box between two heights, around the z axis, in m."""
     x, y = size
     axes = np.linspace(-x / 2, x / 2, 3), np.linspace(-y / 2, y / 2, 5), np.linspace(low, high, 3)
     return np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3)
 
 
 def _waiting_arm(scenario: Scenario, robot: FrankaArm, along_y: list[float]) -> NDArray[np.float64]:
-    """(n, 3) points of an arm's links, at all waiting positions, in the world, in metres."""
+    """Returns points (n, 3) of a waiting arm's links, in the world, in metres."""
     motion = ArmMotion(
         scenario.planner,
         ARM_LIMITS[robot.model],

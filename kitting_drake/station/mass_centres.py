@@ -23,7 +23,7 @@ _LEAST_RATE = 0.02
 def drift(
     rate: NDArray[np.float64], p_BoBcm: NDArray[np.float64], step: float
 ) -> NDArray[np.float64]:
-    """(3,) how far a frame's origin has drifted relative to the centre of mass in one step, in
+    """Returns the drift (3,) of a frame's origin relative to the centre of mass in one step, in
     metres.
 
     Args:

@@ -24,7 +24,7 @@ from systems.sensor_noise import SHEEN_LABELS
 
 _COLOUR_STREAM, _LIGHT_STREAM = 11, 12
 """Numbers of this module's random streams, which NumPy gets together with the seed."""
-_STEEPEST_LIGHT = 0.35
+_FLATTEST_LIGHT = 0.35
 """Least ratio between the downward and the horizontal component of a drawn light's direction."""
 
 
@@ -79,7 +79,7 @@ def lights_of(appearance: Appearance, seed: int) -> list[LightParameter]:
     lights = []
     for share in rng.dirichlet(np.full(count, 2.0)):
         direction = np.append(rng.normal(size=2), 0.0)
-        direction[2] = -rng.uniform(_STEEPEST_LIGHT, 1.5) * np.linalg.norm(direction[:2]) - 0.1
+        direction[2] = -rng.uniform(_FLATTEST_LIGHT, 1.5) * np.linalg.norm(direction[:2]) - 0.1
         direction /= np.linalg.norm(direction)
         tint = 1.0 - rng.uniform(0.0, 0.25 * spread, 3)
         lights.append(_light(Light(direction.tolist(), float(1.3 * total * share), tint.tolist())))

@@ -175,7 +175,7 @@ def _without_axes(text: str) -> str:
 
 
 def robot_state(plant: MultibodyPlant, context: Context) -> NDArray[np.float64]:
-    """(18) positions of an arm's joints and fingers, then their velocities."""
+    """Returns the positions of an arm's joints and fingers, then their velocities (18)."""
     instances = [plant.GetModelInstanceByName(name) for name in (ARM, HAND)]
     positions = [plant.GetPositions(context, instance) for instance in instances]
     velocities = [plant.GetVelocities(context, instance) for instance in instances]
