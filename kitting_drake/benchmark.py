@@ -200,7 +200,7 @@ def _add_trace(benchmarks: Any) -> None:
         "--tools",
         nargs="+",
         metavar="NAME",
-        help="names of the tools, of which three photos each are drawn (default: 20 tools)",
+        help="names of the tools; three photos of each are drawn (default: 20 tools)",
     )
     tracing.add_argument(
         "--no-exif", action="store_true", help="draw photos that do not state their focal length"

@@ -328,9 +328,12 @@ def _policy(arguments: argparse.Namespace) -> BenchPolicy:
 
 def _share(text: str) -> float:
     """Parses a number from 0 to 1, for argparse."""
-    value = float(text)
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
     if not 0 <= value <= 1:
-        raise argparse.ArgumentTypeError("give a probability from 0 to 1")
+        raise argparse.ArgumentTypeError(f"'{text}' is not a probability from 0 to 1")
     return value
 
 
@@ -342,7 +345,10 @@ def _block(arguments: argparse.Namespace, grid: PixelGrid) -> Block | None:
     if not arguments.check:
         raise UserError("--kit_size_mm needs --check")
     if not all(0 < side < 1000 for side in arguments.kit_size_mm):
-        raise UserError("--kit_size_mm takes length, width and height between 0 and 1000 mm")
+        given = " ".join(f"{side:g}" for side in arguments.kit_size_mm)
+        raise UserError(
+            f"--kit_size_mm takes length, width and height between 0 and 1000 mm, not {given}"
+        )
     length, width, height = (side / 1e3 for side in arguments.kit_size_mm)
     pose = None if arguments.kit_pose is None else tuple(arguments.kit_pose)
     if pose is not None and not all(map(math.isfinite, pose)):

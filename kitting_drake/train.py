@@ -266,7 +266,9 @@ def _add_settings(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--method", choices=METHODS, default="so2")
     parser.add_argument("--preset", choices=PRESETS, default="small", help="size of the networks")
-    parser.add_argument("--orientations", type=count_type, default=180, metavar="N", help="(180)")
+    parser.add_argument(
+        "--orientations", type=count_type, default=180, metavar="N", help="number of angles (180)"
+    )
     parser.add_argument(
         "--rotations",
         type=count_type,
@@ -274,7 +276,9 @@ def _add_settings(parser: argparse.ArgumentParser) -> None:
         help="for the transporter: the number of rotations of the crop in a training step; half "
         "as many of the scene are used (default: the minimum: the label's and four others)",
     )
-    parser.add_argument("--steps", type=count_type, default=10_000, help="(10000)")
+    parser.add_argument(
+        "--steps", type=count_type, default=10_000, help="number of training steps (10000)"
+    )
     parser.add_argument(
         "--batch", type=count_type, default=1, metavar="N", help="number of samples in a step (1)"
     )
@@ -297,7 +301,11 @@ def _add_settings(parser: argparse.ArgumentParser) -> None:
         "transporter) and mirroring (both are off if the task does not permit them)",
     )
     parser.add_argument(
-        "--validate-every", type=count_type, default=500, metavar="STEPS", help="(500)"
+        "--validate-every",
+        type=count_type,
+        default=500,
+        metavar="STEPS",
+        help="number of steps between validations (500)",
     )
     parser.add_argument(
         "--seed", type=seed_type, default=0, help="seed of the initial weights and of all draws (0)"
