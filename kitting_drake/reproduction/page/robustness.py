@@ -86,13 +86,13 @@ def robustness_table(runs: Sequence[Run]) -> str:
     needless = _needless_table(common, list(expected))
     if needless:
         parts.append(
-            "Some actions were on objects that have no cavity, such as boxes. The table shows how "
-            "many, of all\nactions in these runs. Success rates do not include these objects:\n\n"
-            + needless
+            "Some actions were on objects that have no cavity, such as boxes. The table has the "
+            "number of these\nactions, of all actions in these runs. Success rates do not include "
+            "these objects:\n\n" + needless
         )
     if further:
         parts.append(
-            "All seeds together are in the last table, for the cells that were run on more seeds. "
+            "The last table has the cells that were run on more seeds, with all their seeds. "
             "Each cell ends with the number of objects:\n\n"
             + _table(found, [label for label in expected if label in further], counted=True)
         )
