@@ -291,7 +291,9 @@ def _read_color_lens(path: Path, name: str, node: Any, where: str) -> ColorLens:
     """Returns the lens of the colour images, from the field `color` of a camera's entry."""
     label = f"{where}: color"
     if not isinstance(node, dict):
-        raise UserError(f"{label} must be a mapping with intrinsics and depth_to_color")
+        raise UserError(
+            f"{label} must be a mapping with intrinsics and depth_to_color, not {node!r}"
+        )
     if "depth_to_color" not in node:
         raise UserError(
             f"{label} lacks depth_to_color: give the transform from the depth's optical frame to "

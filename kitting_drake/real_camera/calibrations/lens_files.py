@@ -139,7 +139,10 @@ def _kalibr(content: dict[str, Any], where: str, stream: str) -> dict[str, Any]:
 
 
 def _open3d(content: dict[str, Any], where: str) -> dict[str, Any]:
-    """Converts Open3D's PinholeCameraIntrinsic, PinholeCameraParameters or recorder intrinsics."""
+    """Converts the intrinsics of Open3D to our own layout.
+
+    Open3D writes them as PinholeCameraIntrinsic, as PinholeCameraParameters, or by its recorders.
+    """
     inner = content.get("intrinsic", content)
     if not isinstance(inner, dict):
         raise UserError(f"{where}: intrinsic must have width, height and intrinsic_matrix")
