@@ -31,8 +31,8 @@ actions. On any other task it is one action per object."""
 
 @dataclass(frozen=True)
 class Changeable:
-    """The number of actions that the memory of failed grasps can have changed, or its bounds, and
-    the number of all actions."""
+    """The least and the largest number of actions that the memory of failed grasps can have
+    changed, and the number of all actions."""
 
     at_least: int
     at_most: int
