@@ -91,14 +91,26 @@ _IN_CAVITY = 0.0008
 
 
 @dataclass(frozen=True)
+class Obstacle:
+    """Something beside a loose tool."""
+
+    outline: CrossSection
+    """The outline in the world, seen from above, in metres."""
+    tool: RandomTool | None = None
+    """The tool; None for the kit and for a box."""
+    X_WT: RigidTransform = RigidTransform()
+    """The pose of the tool."""
+
+
+@dataclass(frozen=True)
 class LooseTool:
     """A loose tool on the table, and the pose at which it is seated."""
 
     tool: RandomTool
     X_WT: RigidTransform
     X_WGoal: RigidTransform
-    around: tuple[CrossSection, ...]
-    """The outlines, seen from above in metres, of the kit and of all other objects on the table."""
+    around: tuple[Obstacle, ...]
+    """The kit and all other objects on the table."""
 
 
 @dataclass(frozen=True)
@@ -239,9 +251,13 @@ def _draw_scene(
     bodies += [(block_text(box.size), box.X_WB) for box in boxes]
     noise = _draw_noise(rng)
 
-    standing = [outline_at(block_outline(kit), X_WKit)]
-    standing += [_outline(tool, X) for tool, X in zip(lying, X_WTools, strict=True)]
-    standing += [outline_at(CrossSection.square(box.size[:2], True), box.X_WB) for box in boxes]
+    standing = [Obstacle(outline_at(block_outline(kit), X_WKit))]
+    standing += [
+        Obstacle(_outline(tool, X), tool, X) for tool, X in zip(lying, X_WTools, strict=True)
+    ]
+    standing += [
+        Obstacle(outline_at(CrossSection.square(box.size[:2], True), box.X_WB)) for box in boxes
+    ]
     found = []
     for place, index in enumerate(loose):
         around = tuple(item for k, item in enumerate(standing) if k != place + 1)
@@ -325,7 +341,7 @@ def _actions(number: int, loose: LooseTool) -> list[tuple[float, ...]]:
         pick = X_WT @ np.array([grasp.x, grasp.y, 0.0])
         theta = yaw + grasp.theta
         fingers = rectangle_at(OPEN_FINGERS, pick[0], pick[1], theta)
-        if any((fingers ^ other).area() > 1e-9 for other in loose.around):
+        if any((fingers ^ other.outline).area() > 1e-9 for other in loose.around):
             continue
         place = X_WGoal @ np.array([grasp.x, grasp.y, 0.0])
         rows.append(

@@ -3,13 +3,16 @@ probability of success."""
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
 from kitting_drake.policies.data.images import rotation_matrix
 from kitting_drake.policies.matching.refinement import nearest_region
-from kitting_drake.policies.matching.regions.segmentation import Segmentation
+from kitting_drake.policies.matching.regions.segmentation import Region, Segmentation
+from kitting_drake.policies.matching.registration import Registration, fit_quality, trace_outline
 
 Array = NDArray[np.float64]
 
@@ -20,6 +23,13 @@ _RING = 3
 """How far the surroundings of an object extend from it, in pixels."""
 _HOLE = 0.003
 """The least depth of a hole below its rim, in metres."""
+_REGION_FACTS = (
+    *("is_object", "object_seen", "depth", "hole", "size", "apart"),
+    *("over_recess", "cost", "reverse", "spread", "rival", "offset", "too_high", "recess_seen"),
+)
+"""The facts that need an object under the pick, or a recess under the place; otherwise zero."""
+_FAR = 20.0
+"""Upper limit of the distance from other objects, in mm."""
 _WORST_FIT = 0.002
 _WORST_GRASP = 5.0
 
@@ -43,22 +53,18 @@ def geometric_evidence(
             do not fit.
         grasp_cost: the cost of the grasp, see `JawGrasp.cost`; None if there is no feasible grasp.
     """
+    seen, relief = segmentation.visibility.seen, segmentation.relief
     fits, grasped = fit_cost is not None, grasp_cost is not None
-    evidence = {
+    evidence = dict.fromkeys(_REGION_FACTS, 0.0) | {
         "outlines_fit": float(fits),
         "fit": 1e3 * min(fit_cost, _WORST_FIT) if fit_cost is not None else 0.0,
         "jaws_have_room": float(grasped),
         "grasp": min(grasp_cost, _WORST_GRASP) if grasp_cost is not None else 0.0,
-        "is_object": 0.0,
-        "object_seen": 0.0,
-        "place_seen": 0.0,
-        "depth": 0.0,
-        "hole": 0.0,
+        "noise": 1e3 * min(segmentation.noise, 0.003),
     }
     region = nearest_region(segmentation.objects, pick)
     if region is None:
         return evidence
-    seen, relief = segmentation.visibility.seen, segmentation.relief
     rows, cols = seen.shape
     there = np.rint(place + (region.pixels - pick) @ rotation_matrix(rotation).T).astype(int)
     inside = ((there >= 0) & (there < (rows, cols))).all(axis=1)
@@ -72,9 +78,54 @@ def geometric_evidence(
     return evidence | {
         "is_object": 1.0,
         "object_seen": float(seen[_ring(region.mask)].mean()),
-        "place_seen": float(seen[around].mean()) if around.any() else 0.0,
         "depth": float(np.clip(1e3 * (rim - floor), -10.0, 30.0)),
         "hole": float(low.mean()),
+        "size": math.log(len(region.pixels)),
+        "apart": _apart(segmentation, region),
+        **_fit_facts(segmentation, region, target, pick, rotation, place),
+    }
+
+
+def _apart(segmentation: Segmentation, region: Region) -> float:
+    """The distance of an object from the nearest other one, at most `_FAR`, in mm."""
+    others = np.ones(region.mask.shape, bool)
+    for item in segmentation.objects:
+        if item is not region:
+            others &= ~item.mask
+    if others.all():
+        return _FAR
+    away = ndimage.distance_transform_edt(others)[region.mask].min()
+    return float(min(1e3 * away * segmentation.visibility.resolution, _FAR))
+
+
+def _fit_facts(
+    segmentation: Segmentation,
+    region: Region,
+    target: NDArray[np.bool_],
+    pick: Array,
+    rotation: float,
+    place: Array,
+) -> Evidence:
+    """Facts about the fit of an object to the recess under its place, zero if there is none."""
+    overlaps = [int((item.mask & target).sum()) for item in segmentation.recesses]
+    if not overlaps or not max(overlaps):
+        return {}
+    recess = segmentation.recesses[int(np.argmax(overlaps))]
+    resolution = segmentation.visibility.resolution
+    quality = fit_quality(
+        trace_outline(region.mask, resolution, close=True),
+        trace_outline(recess.mask, resolution),
+        Registration(rotation, place - rotation_matrix(rotation) @ pick, 0.0),
+    )
+    return {
+        "over_recess": 1.0,
+        "cost": 1e3 * min(quality.cost, 0.005),
+        "reverse": 1e3 * min(quality.reverse, 0.008),
+        "spread": 1e3 * resolution * min(quality.spread, 1.0),
+        "rival": 1e3 * float(np.clip(quality.rival, -0.003, 0.006)),
+        "offset": 1e3 * quality.offset,
+        "too_high": 1e3 * float(np.clip(region.height - recess.height, -0.03, 0.03)),
+        "recess_seen": float(segmentation.visibility.seen[recess.mask].mean()),
     }
 
 

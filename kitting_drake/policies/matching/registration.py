@@ -47,6 +47,9 @@ this many metres. A larger offset could hide a wrong pose."""
 _HEIGHT_WEIGHT = 0.1
 """The weight, in a mismatch, of the difference between the object's height and the recess's
 depth."""
+_SAME_ROTATION, _OTHER_ROTATION = math.radians(8), math.radians(25)
+"""Rotations closer than the first angle count as the same; those farther apart than the second are
+clearly different."""
 _POINTS, _COARSE_POINTS = 700, 160
 _ROTATIONS = 72
 _STARTS = 3
@@ -220,6 +223,58 @@ def residuals(outline: Outline, recess: Outline, fit: Registration) -> Array:
     return recess.sample(recess.distance, positions, _FARTHEST) - outline.values - fit.offset
 
 
+@dataclass(frozen=True)
+class FitQuality:
+    """How well an object's outline, moved to a place, fits the recess there."""
+
+    cost: float
+    """The mean distance of the object's points from the recess's outline, in metres."""
+    reverse: float
+    """The mean distance of the recess's points from the object's outline, in metres."""
+    spread: float
+    """The standard deviation of the position of the object's points, in pixels, if the distances at
+    the points were independent."""
+    rival: float
+    """The least coarse cost of a clearly different rotation, minus that of this rotation, in
+    metres. It is small for objects with rotational symmetry."""
+    offset: float
+    """How much larger the recess is than the object on every side, in metres."""
+
+
+def fit_quality(outline: Outline, recess: Outline, fit: Registration) -> FitQuality:
+    """Measures how well an object fits a recess at the place to which a registration moves it.
+
+    Args:
+        outline: the outline of the object, with closed notches.
+        recess: the outline of the recess.
+        fit: the rotation and shift of the object. Its other fields are not used.
+    """
+    there, offset = _recess_distances(outline, recess, fit)
+    away = there - offset - outline.values
+    costs, angles = _coarse(outline, recess)
+    apart = np.abs((angles - fit.rotation + math.pi) % math.tau - math.pi)
+    here, others = costs[apart < _SAME_ROTATION], costs[apart > _OTHER_ROTATION]
+    return FitQuality(
+        cost=float(np.abs(away).mean()),
+        reverse=_reverse(outline, recess, fit),
+        spread=_spread(outline, recess, fit, away),
+        rival=float(others.min() - here.min()),
+        offset=offset,
+    )
+
+
+def _spread(outline: Outline, recess: Outline, fit: Registration, away: Array) -> float:
+    """Computes `FitQuality.spread` by linear error propagation from the distances `away` (p,)."""
+    turned = (outline.points - outline.middle) @ rotation_matrix(fit.rotation).T
+    jacobian = _jacobian(recess, turned, fit.moved(outline.middle) + turned)
+    weighted = jacobian / np.maximum(1, np.abs(away) / _ROBUST)[:, None]
+    normal = weighted.T @ jacobian
+    normal += np.diag(1e-4 * np.diag(normal) + 1e-12)
+    variances = np.diag(np.linalg.inv(normal)) * np.minimum(away**2, _ROBUST**2).mean()
+    arms = np.square(turned).sum(axis=1).mean()
+    return float(np.sqrt(variances[0] * arms + variances[1] + variances[2]))
+
+
 def is_covered(outline: Outline, recess: Outline, fit: Registration) -> bool:
     """Whether, after a fit, all of the recess's outline lies near the object's outline.
 
@@ -227,10 +282,15 @@ def is_covered(outline: Outline, recess: Outline, fit: Registration) -> bool:
     then seems to fit into a longer cavity, or onto the visible remainder of a filled recess.
     Distances from points of the recess's outline show that such fits are poor.
     """
+    return _reverse(outline, recess, fit) < _WORST_REVERSE
+
+
+def _reverse(outline: Outline, recess: Outline, fit: Registration) -> float:
+    """The mean distance of the recess's points from the object's outline, in metres."""
     back = (recess.points - fit.shift) @ rotation_matrix(fit.rotation)
     _, offset = _recess_distances(outline, recess, fit)
     reverse = outline.sample(outline.distance, back, _FARTHEST) - recess.values + offset
-    return float(np.abs(reverse).mean()) < _WORST_REVERSE
+    return float(np.abs(reverse).mean())
 
 
 def mismatch(fit: Registration, item: Region, recess: Region) -> float:
@@ -298,10 +358,7 @@ def _refine(
             cost, best = now, (rotation, place, offset)
             if improved < 1e-6:
                 break
-        by_row = recess.sample(recess.gradient[0], positions, 0.0) * _SUBSAMPLING
-        by_col = recess.sample(recess.gradient[1], positions, 0.0) * _SUBSAMPLING
-        by_rotation = by_col * turned[:, 0] - by_row * turned[:, 1]
-        jacobian = np.column_stack([by_rotation, by_row, by_col, -np.ones(len(residual))])
+        jacobian = _jacobian(recess, turned, positions)
         weighted = jacobian * weight[:, None]
         normal = weighted.T @ jacobian
         normal += np.diag(1e-4 * np.diag(normal) + 1e-12)
@@ -312,3 +369,18 @@ def _refine(
     rotation, place, offset = best
     shift = place - rotation_matrix(rotation) @ outline.middle
     return Registration(rotation, shift, cost, offset)
+
+
+def _jacobian(recess: Outline, turned: Array, positions: Array) -> Array:
+    """(p, 4): the derivatives of the distances from a recess's outline by rotation, row, col and
+    offset.
+
+    Args:
+        recess: the outline of the recess.
+        turned: (p, 2) the points of the object relative to its centroid, after its rotation.
+        positions: (p, 2) the points at the object's place.
+    """
+    by_row = recess.sample(recess.gradient[0], positions, 0.0) * _SUBSAMPLING
+    by_col = recess.sample(recess.gradient[1], positions, 0.0) * _SUBSAMPLING
+    by_rotation = by_col * turned[:, 0] - by_row * turned[:, 1]
+    return np.column_stack([by_rotation, by_row, by_col, -np.ones(len(turned))])

@@ -52,8 +52,9 @@ _WITHOUT_KIT = 0.1
 _DECISIONS = 3
 """The largest number of decisions of a policy in a scene. Each avoids the tools of the earlier
 ones."""
-_MOST_WRONG = 0.02
-"""The largest share of wrong decisions among those above the threshold."""
+LEAST_CONFIDENCE = 0.9
+"""The fitted confidence below which a robot does not act. The confidence is the probability of
+success, so this follows from what a wrong action costs, and need not be fitted."""
 _FOLDS, _FOLD = 6, 10
 """The number of parts in the cross-validation, and the number of successive scenes that stay in one
 part."""
@@ -132,7 +133,7 @@ def summarize_all(
             confidences = [_confidence(found[policy], item) for item in chosen]
         else:
             confidences = _cross_validated(chosen)
-            found[policy] = replace(fit(chosen), threshold=_threshold(chosen, confidences))
+            found[policy] = fit(chosen)
         summaries[policy] = _by_cameras(chosen, confidences, found[policy].threshold)
     if fitted is not None:
         write_json(fitted / "confidence.json", {k: asdict(item) for k, item in found.items()})
@@ -193,7 +194,7 @@ def draw_judged(first_seed: int, count: int, weights: Path | None = None) -> Ite
             tried: list[PlanarPose] = []
             for _ in range(_DECISIONS):
                 action, evidence = decide(observation, tried)
-                verdict = "stop" if action.stop else judge(action, scene.loose)
+                verdict = "stop" if action.stop else judge(action, scene.loose, planner)
                 cameras = len(scene.cameras) if scene.cameras != Scenario().cameras else 0
                 yield Judged(policy, number, verdict, evidence, cameras, action.reason)
                 if action.stop:
@@ -238,7 +239,7 @@ def _draw_noise(rng: np.random.Generator) -> SensorNoiseParameters:
 
 
 def fit(judged: list[Judged]) -> Reliability:
-    """Fits the regression of one policy, with a threshold of 0."""
+    """Fits the regression of one policy. The threshold is `LEAST_CONFIDENCE`."""
     acted = [item for item in judged if item.verdict != "stop"]
     names = sorted(acted[0].evidence)
     facts = np.array([[item.evidence[name] for name in names] for item in acted])
@@ -258,18 +259,7 @@ def fit(judged: list[Judged]) -> Reliability:
     weights = found[:-1] / spread
     constant = float(found[-1] - weights @ middle)
     plain = dict(zip(names, map(float, weights), strict=True)) | {"": constant}
-    return Reliability(plain, 0.0)
-
-
-def _threshold(judged: list[Judged], confidences: list[float]) -> float:
-    """Returns the least threshold above which at most `_MOST_WRONG` of the decisions are wrong."""
-    acted = [k for k, item in enumerate(judged) if item.verdict != "stop"]
-    confidence = np.array([confidences[k] for k in acted])
-    right = np.array([judged[k].verdict == "right" for k in acted])
-    order = np.argsort(-confidence)
-    wrong = np.cumsum(~right[order]) / np.arange(1, len(order) + 1)
-    good = np.flatnonzero(wrong <= _MOST_WRONG)
-    return round(float(confidence[order[good[-1]]]), 3) if len(good) else 1.0
+    return Reliability(plain, LEAST_CONFIDENCE)
 
 
 @dataclass(frozen=True)

@@ -23,17 +23,27 @@ _MASS = 0.1
 it."""
 
 
+def solid_of(tool: Tool) -> Manifold:
+    """Makes the solid of a tool in its frame T, in metres."""
+    mesh = _mesh(tool)
+    return Manifold(Mesh(np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.uint32)))
+
+
+def _mesh(tool: Tool) -> trimesh.Trimesh:
+    corners = np.arange(3 * len(tool.triangles)).reshape(-1, 3)
+    mesh = trimesh.Trimesh(tool.triangles.reshape(-1, 3), corners)
+    mesh.merge_vertices(digits_vertex=7)
+    return mesh
+
+
 def convex_body(tool: Tool) -> ConvexBody:
     """Cuts a tool into slabs along its length. Each connected part of a slab becomes a convex
     piece.
 
     Pieces are convex hulls, so notches narrower than the thickness of a slab are filled.
     """
-    mesh = trimesh.Trimesh(
-        tool.triangles.reshape(-1, 3), np.arange(3 * len(tool.triangles)).reshape(-1, 3)
-    )
-    mesh.merge_vertices(digits_vertex=7)
-    solid = Manifold(Mesh(np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.uint32)))
+    mesh = _mesh(tool)
+    solid = solid_of(tool)
     low, high = mesh.bounds[:, 0]
     edges = np.linspace(low, high, max(1, round((high - low) / _SLAB)) + 1)
     hulls = []

@@ -7,7 +7,12 @@ import pytest
 
 from kitting_drake.policies.confidence import read_reliability
 from kitting_drake.policies.matching.shape_matching import ShapeMatchingPolicy
-from kitting_drake.reproduction.benchmarks.reliability import Judged, fit, summarize
+from kitting_drake.reproduction.benchmarks.reliability import (
+    LEAST_CONFIDENCE,
+    Judged,
+    fit,
+    summarize,
+)
 from systems.pick_place_parameters import PickPlaceParameters
 from tests.kitting_drake.policies.matching.regions.visibility_test import kit_and_bar
 
@@ -41,7 +46,7 @@ def test_the_fit_finds_the_law_and_is_calibrated():
 @pytest.mark.parametrize("policy", ["networks", "shape_matching"])
 def test_the_shipped_regressions(policy: str):
     found = read_reliability(policy)
-    assert 0.5 <= found.threshold < 1
+    assert found.threshold == LEAST_CONFIDENCE
     assert found.weights["fit"] < 0
 
 
