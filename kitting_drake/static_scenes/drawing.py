@@ -98,8 +98,8 @@ class Obstacle:
     """The outline in the world, seen from above, in metres."""
     tool: RandomTool | None = None
     """The tool; None for the kit and for a box."""
-    X_WT: RigidTransform = RigidTransform()
-    """The pose of the tool."""
+    X_WT: RigidTransform | None = None
+    """The pose of the tool; None without one."""
 
 
 @dataclass(frozen=True)

@@ -114,7 +114,7 @@ def _touches(finger: CrossSection, tip: float, other: Obstacle) -> bool:
     """Whether a finger that comes down to the height `tip` touches an obstacle."""
     if (finger ^ other.outline).area() <= _TOUCHED:
         return False
-    if other.tool is None:
+    if other.tool is None or other.X_WT is None:
         return True
     above = _world_solid(other.tool, other.X_WT).trim_by_plane((0, 0, 1), tip)
     return bool((finger ^ above.project()).area() > _TOUCHED)

@@ -37,6 +37,7 @@ _NOT_THE_TASK = ("policy", "random_seed", "target_realtime_rate", "meshcat")
 _ADDED: dict[str, Any] = {
     "task.kit.clearance_of": {},
     "task.kit.stand_out": 0.0,
+    "task.cavities": [],
     "task.distractors": 0,
     "task.tries": 1,
     "task.pool": [],
