@@ -181,7 +181,7 @@ def _fill_shadows(filled: NDArray[np.float32], shadows: NDArray[np.bool_]) -> No
     seen = filled.copy()
     labels, _ = ndimage.label(shadows, np.ones((3, 3), bool))
     for label, place in enumerate(ndimage.find_objects(labels), 1):
-        # Gaps may lie between a shadow and the nearest seen pixels.
+        # Narrow gaps may separate a shadow from the nearest seen pixels, so look further.
         rows, cols = (slice(max(part.start - 2, 0), part.stop + 2) for part in place)
         shadow, around = labels[rows, cols] == label, seen[rows, cols]
         border = ndimage.binary_dilation(shadow, _SHADOW, iterations=2) & np.isfinite(around)

@@ -80,7 +80,9 @@ def prepare_tool(
         path = str(request.mesh)
         raise UserError(text if path in text else f"{path}: {text}") from error
     except MemoryError as error:
-        raise UserError(f"{request.mesh} needs more memory than is available") from error
+        raise UserError(
+            f"{request.mesh} needs more memory than is available: simplify it first"
+        ) from error
     except OSError as error:
         raise UserError(f"cannot write {name}: {error.strerror}") from error
     except Exception as error:

@@ -299,8 +299,11 @@ class FactoredNetworks(Networks):
         yield "pick_angle", lambda: self._angle_loss(sample, pixels)
 
     def _angle_loss(self, sample: LabelledImage, pixels: list[tuple[int, int]]) -> Tensor:
-        """Returns the mean loss over the crops of all picks. If the sample has curvatures, the mean
-        includes a bent copy of each crop."""
+        """Returns the mean loss over the crops of all picks.
+
+        If the sample has curvatures, the mean also includes the `curved_crop` of each pick, which
+        shows the object bent.
+        """
         orientations = self.config.orientations
         crops = [crop(sample.image, pixel, sizes.PICK_CROP) for pixel in pixels]
         thetas = [sample.pick_theta, *sample.other_thetas]

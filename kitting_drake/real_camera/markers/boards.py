@@ -261,8 +261,8 @@ def _pose(content: dict[str, Any], size: tuple[float, float], path: Path) -> Arr
     that were touched with the robot."""
     if ("pose" in content) == ("touch" in content):
         raise UserError(
-            f"{path} must have either pose (of the board in the base frame), or touch with the "
-            f"positions of {', '.join(_CORNERS)}"
+            f"{path} must have either 'pose' (of the board in the base frame) or 'touch' (the "
+            f"positions of {', '.join(_CORNERS)}), not both"
         )
     if "pose" in content:
         return pose_of_value(content["pose"], f"{path}: pose").X

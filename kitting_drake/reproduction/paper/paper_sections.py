@@ -50,7 +50,8 @@ def paper_sections(
     Args:
         results: the results from `cell_results`.
         efficiency: the result of `benchmark networks`; None without one.
-        to_run_again: the names of the cells whose runs are set aside.
+        to_run_again: the names of the runs from trees with uncommitted changes. No table may use
+            these runs; their cells must be run again.
     """
     if not results:
         return []
@@ -170,7 +171,7 @@ def fresh_tools(results: Sequence[Result], again: Collection[str] = ()) -> list[
 
     Args:
         results: the results from `cell_results`.
-        again: the names of the cells whose runs are set aside.
+        again: `to_run_again` of `paper_sections`.
     """
     by_name = {result.cell.name: result for result in results}
     found = {label: by_name.get(f"fresh_{label}") for label in SHIPPED}

@@ -63,7 +63,8 @@ def protocol_sections(
     Args:
         results: the results from `cell_results`.
         rates: the cost of each learning rate of each baseline on validation scenes.
-        to_run_again: the names of the cells whose runs are set aside.
+        to_run_again: the names of the runs from trees with uncommitted changes. No table may use
+            these runs; their cells must be run again.
     """
     if not results:
         return []
@@ -132,8 +133,11 @@ def _trainings(results: Mapping[str, Result], again: Collection[str]) -> list[st
 
 
 def _mean_rates(results: Sequence[Result]) -> str:
-    """Returns the means of the strict rate and of the rate by the paper's measure, as text. Several
-    results also give standard deviations."""
+    """Returns the mean strict rate and the mean rate by the paper's measure, in percent, as text
+    such as "95.1 / 96.3".
+
+    With more than one result, each mean is followed by its results' standard deviation.
+    """
     texts = []
     for rate in (STRICT, OWN):
         percents = [100 * result.summary[rate] for result in results]

@@ -46,7 +46,7 @@ _BLIND = 0.020
 
 @dataclass(frozen=True)
 class Visibility:
-    """The pixels of an observation that are seen, or could be seen."""
+    """Which pixels of an observation some camera sees, and which lie within some camera's view."""
 
     seen: Mask
     """(rows, cols) mask of the pixels that some camera sees."""

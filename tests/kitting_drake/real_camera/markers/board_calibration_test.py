@@ -305,7 +305,7 @@ def test_wrong_sizes_are_noticed(tmp_path: Path):
         ("columns: 7\n", "", "board.yaml lacks 'columns'"),
         ("square:", "sqare:", "unknown field 'sqare': did you mean 'square'"),
         ("rpy_deg: [0, 0, 30]", "rpy_deg: [180, 0, 30]", "is tilted by 180.0 degrees: it must lie"),
-        (POSE, "", "must have either pose .of the board in the base frame., or touch"),
+        (POSE, "", "must have either 'pose' .of the board in the base frame. or 'touch'"),
     ],
 )
 def test_descriptions_that_cannot_be_used_are_refused(
