@@ -281,7 +281,9 @@ def _run_episode(folder: Path, seed: int, text: str) -> _Outcome:
     result = run_chosen(chosen, diagram, station, observers=[observe] if pictured else [])
     tools: dict[str, ToolProof] = {}
     for item in result.objects:
-        tool = tools.setdefault(item.name, ToolProof(item.name, int(item.strict_success), 1))
+        tool = tools.setdefault(item.name, ToolProof(item.name))
+        tool.tried += 1
+        tool.kitted += item.strict_success
         if not item.strict_success:
             tool.causes[item.cause or _OFF] += 1
     for action in result.actions_taken:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from kitting_drake.hkd.tracing.scales import Scale
     from kitting_drake.hkd.tracing.tracer import TracedTool
 
-_OUTLINE_ERROR_MM = 0.5
+_OUTLINE_ERROR_MM = 0.8
 """A tool extends by less than this, in mm, beyond almost all of a traced outline that is not in
 doubt. Cavities are wider by this."""
 

@@ -27,8 +27,8 @@ from kitting_drake.reproduction.benchmarks.trace_benchmark import TOOLS, drawn_c
 from kitting_drake.reproduction.benchmarks.trace_photos import draw_photo
 from kitting_drake.scenario.choosing import find_scenario
 
-_PHOTOS = 4
-"""A photo whose outline is in doubt is taken again, at most this often in all."""
+_PHOTOS = 6
+"""The largest number of photos of a tool. A photo whose outline is in doubt is taken again."""
 _TOOLS = 4
 _LINES = "kits.jsonl"
 
@@ -68,11 +68,14 @@ def measure_traced_kits(
 def _measure(number: int, seed: int, clearance_mm: float, folder: Path) -> dict[str, Any]:
     """Makes one kit and fills it."""
     photos: list[dict[str, Any]] = []
-    names = _names(number, seed)
-    cavities = [
-        str(_traced(name, _TOOLS * number + slot, seed, folder / name, photos).resolve())
-        for slot, name in enumerate(names)
-    ]
+    traced = {
+        name: _traced(name, _TOOLS * number + slot, seed, folder / name, photos)
+        for slot, name in enumerate(_names(number, seed))
+    }
+    names = [name for name, place in traced.items() if place is not None]
+    cavities = [str(place.resolve()) for place in traced.values() if place is not None]
+    if not names:
+        raise UserError("all photos of all tools are in doubt: take another --seed")
     export_kit(KitRequest(tuple(cavities), folder / "kit", clearance_mm=clearance_mm))
     task = json.dumps({"tools": names, "cavities": cavities, "tries": 1})
     chosen = find_scenario(
@@ -81,7 +84,8 @@ def _measure(number: int, seed: int, clearance_mm: float, folder: Path) -> dict[
     result = run_chosen(chosen, *build_chosen(chosen, seed=seed + number))
     if result.interrupted:
         raise KeyboardInterrupt
-    return {"kit": number, "photos": photos, "episode": result.as_dict()}
+    left_out = [name for name, place in traced.items() if place is None]
+    return {"kit": number, "photos": photos, "left_out": left_out, "episode": result.as_dict()}
 
 
 def _names(number: int, seed: int) -> list[str]:
@@ -91,10 +95,15 @@ def _names(number: int, seed: int) -> list[str]:
     return [TOOLS[index] for index in mixed[place : place + _TOOLS]]
 
 
-def _traced(name: str, index: int, seed: int, folder: Path, photos: list[dict[str, Any]]) -> Path:
-    """Traces a tool, and returns the folder of the traced tool. Appends its photos to `photos`."""
+def _traced(
+    name: str, index: int, seed: int, folder: Path, photos: list[dict[str, Any]]
+) -> Path | None:
+    """Traces a tool, and appends its photos to `photos`.
+
+    Returns:
+        The folder of the traced tool; None if all photos are refused or in doubt.
+    """
     true = load_tool(name)
-    report = None
     for attempt in range(_PHOTOS):
         spec, drawn = drawn_case(name, _PHOTOS * index + attempt, attempt % 3, True, seed)
         drawn = dataclasses.replace(drawn, height=1e3 * true.height)
@@ -111,11 +120,10 @@ def _traced(name: str, index: int, seed: int, folder: Path, photos: list[dict[st
             continue
         entry["doubts"] = sum(len(tool.doubts) for tool in report.tools)
         if not entry["doubts"]:
-            break
-    if report is None:
-        raise UserError(f"no photo of {name} can be traced: {photos[-1]['refused']}")
-    traced = max(report.tools, key=lambda tool: tool.outline.area())
-    return import_traced(traced, true.category, f"traced_{name}", folder / "tools").directory
+            traced = max(report.tools, key=lambda tool: tool.outline.area())
+            place = folder / "tools"
+            return import_traced(traced, true.category, f"traced_{name}", place).directory
+    return None
 
 
 def _summary(lines: list[dict[str, Any]]) -> dict[str, Any]:
@@ -127,6 +135,7 @@ def _summary(lines: list[dict[str, Any]]) -> dict[str, Any]:
     return {
         "kits": len(lines),
         "tools": len(objects),
+        "left_out": sum(len(line["left_out"]) for line in lines),
         "strict": strict,
         "interval": proportion_interval(strict, len(objects)),
         "failed": {
@@ -147,6 +156,7 @@ def traced_kits_table(measured: dict[str, Any]) -> Table:
     low, high = measured["interval"]
     table.add_row("strict successes", f"{measured['strict']} of {measured['tools']}")
     table.add_row("95 % interval, %", f"{100 * low:.0f} to {100 * high:.0f}")
+    table.add_row("tools left out: all photos in doubt", str(measured["left_out"]))
     table.add_row(
         "photos; in doubt, refused",
         f"{measured['photos']}; {measured['photos_in_doubt']}, {measured['photos_refused']}",
