@@ -261,8 +261,8 @@ def _add_policy_flags(parser: argparse.ArgumentParser) -> None:
         "--least_confidence",
         type=_share,
         metavar="P",
-        help="act only if the probability of success is at least this (default: the fitted "
-        "threshold)",
+        help="act only if the probability of success is at least this (default: that "
+        "of confidence.json, 0.9)",
     )
     parser.add_argument("--recover", action="store_true", help="recover from failed insertions")
 

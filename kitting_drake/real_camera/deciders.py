@@ -181,7 +181,7 @@ def load_policy(
         parameters: the parameters of the robot's motion; None for the simulated cell's defaults.
             Give `decide` the same.
         least_confidence: the least confidence, from 0 to 1, with which the policy acts; None for
-            the fitted threshold.
+            the threshold of `confidence.json`, 0.9.
 
     Raises:
         UserError: the file is unusable, or the networks do not support N orientations.

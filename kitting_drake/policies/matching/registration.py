@@ -47,9 +47,10 @@ this many metres. A larger offset could hide a wrong pose."""
 _HEIGHT_WEIGHT = 0.1
 """The weight, in a mismatch, of the difference between the object's height and the recess's
 depth."""
-_SAME_ROTATION, _OTHER_ROTATION = math.radians(8), math.radians(25)
-"""Rotations closer than the first angle count as the same; those farther apart than the second are
-clearly different."""
+_SAME_ROTATION = math.radians(8)
+"""Rotations closer than this angle count as the same."""
+_OTHER_ROTATION = math.radians(25)
+"""Rotations farther apart than this angle are clearly different."""
 _POINTS, _COARSE_POINTS = 700, 160
 _ROTATIONS = 72
 _STARTS = 3
