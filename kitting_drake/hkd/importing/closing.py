@@ -22,8 +22,8 @@ def capped(vertices: Array, faces: Faces) -> Faces | None:
         faces: the triangles (m, 3), consistently wound.
 
     Returns:
-        The triangles (k, 3) of the surface and the caps. None if an opening is not flat or its rim
-        touches itself.
+        The triangles (k, 3) of the surface and the caps. None if there is no opening, or if an
+        opening is not flat or its rim touches itself.
     """
     loops = _rims(faces)
     if not loops:

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-# The difference in area (mm^2) up to which two outlines count as equal.
+# A region counts as inside another one if at most this area (mm^2) of it lies outside.
 _AREA = 0.02
 # The number of corners through which to try a cut, and the number of angles at each corner.
 _CORNERS, _ANGLES = 6, 8
@@ -27,7 +27,7 @@ def convex_cover(
     are moved to match `outline` as closely as possible. The result is deterministic.
 
     Args:
-        inner: the region to cover, without holes.
+        inner: the region to cover; it may have holes.
         outer: the allowed region; it contains `inner`.
         outline: the preferred region; it contains `inner` and lies within `outer`.
     """
@@ -90,8 +90,8 @@ def _best_cut(part: CrossSection, outer: CrossSection) -> list[CrossSection]:
 def _cut_points(part: CrossSection) -> list[Array]:
     """Returns the points (2,) through which to try cuts of a part.
 
-    These are its centre, and the corners that lie deepest inside its hull and apart from each
-    other.
+    These are the centre of its bounding box, and the corners that lie deepest inside its hull.
+    Corners that are close to a chosen corner are skipped.
     """
     corners = _corners(part)
     hull = _corners(part.hull())
@@ -100,8 +100,8 @@ def _cut_points(part: CrossSection) -> list[Array]:
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     depth = ((hull * normals).sum(axis=1) - corners @ normals.T).min(axis=1)
     spacing = 0.1 * np.ptp(corners, axis=0).max()
-    # Try the centre first. If all cuts of an arc are equally good, cutting it in half gives the
-    # fewest cells.
+    # Try the centre first. Many cuts of an arc-shaped part are equally good, and a cut in the
+    # middle then gives the fewest cells.
     chosen = [0.5 * (corners.min(axis=0) + corners.max(axis=0))]
     for index in np.argsort(-depth, kind="stable"):
         if all(np.linalg.norm(corners[index] - other) > spacing for other in chosen[1:]):

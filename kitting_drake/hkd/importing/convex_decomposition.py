@@ -1,9 +1,10 @@
 """Approximate convex decomposition of any solid for collision. Lengths are in mm.
 
-Hydroelastic contact costs time per hull and per facet, so both are limited. The first hulls cover
-the outline as seen from above (`convex_cover`), because the outline decides whether the tool enters
-its cavity. The remaining hulls refine the heights. All vertices of a hull are points of the solid,
-so the tool rests on a table as the solid does.
+Hydroelastic contact costs time per hull and per facet, so both are limited. First, convex polygons
+cover the outline as seen from above (`convex_cover`), because the outline decides whether the tool
+enters its cavity. The parts of the solid over the polygons are then cut where their hulls add much
+volume. All vertices of a hull are points of the solid, so the tool rests on a table as the solid
+does.
 """
 
 from dataclasses import dataclass
@@ -25,8 +26,7 @@ OUTLINE_TOLERANCES_MM = ((0.26, 0.12), (0.30, 0.2), (0.4, 0.2), (0.6, 0.3), (0.9
 """Pairs of tolerances of the hulls, for the outline and for the gripped faces, before vertices are
 thinned. A pair is tried if the one before it needs too many hulls."""
 ADDED_SHARE = 0.05
-"""The largest volume that one hull may add above and below the tool, as a share of the tool's
-volume."""
+"""A part is cut in two if its hull adds a larger share than this of the tool's volume."""
 # The vertices of a hull are thinned with the first tolerance that leaves at most `_MOST_VERTICES`.
 # If none does, the last tolerance is used. The outline has its own tolerance.
 _MOST_VERTICES = 20
@@ -34,6 +34,7 @@ _VERTEX_TOLERANCES_MM = (0.2, 0.3, 0.45, 0.6)
 _OUTLINE_VERTEX_TOLERANCE_MM = 0.08
 # Half the width of the notches that hulls may bridge, because cavities bridge these notches, too.
 _NOTCH_MM = 2.0
+# Parts with a smaller volume (mm^3) are dropped.
 _SMALLEST_VOLUME = 0.5
 
 
@@ -44,8 +45,8 @@ class Decomposition:
     hulls: list[np.ndarray]
     """The vertices (n, 3) of each hull, in mm."""
     outline_deviation_mm: float
-    """The largest distance between the hulls' outline from above and the solid's, in mm. A larger
-    distance than 5 mm is given as 5 mm."""
+    """The largest distance between the outlines of the hulls and of the solid from above, in mm, at
+    most 5. Notches narrower than 4 mm are ignored. Infinity if there are no hulls."""
 
 
 def decompose(solid: Manifold, grasp: Grasp) -> Decomposition:
@@ -53,7 +54,7 @@ def decompose(solid: Manifold, grasp: Grasp) -> Decomposition:
 
     Args:
         solid: the tool at rest in its frame T, in mm.
-        grasp: the annotated grasp in T.
+        grasp: a grasp in T. The hulls follow the gripped faces more closely than other faces.
     """
     solid = solid.simplify(0.03)
     outline = closed(solid.project().simplify(0.02), _NOTCH_MM).simplify(0.02)
@@ -95,7 +96,10 @@ def _within(solid: Manifold, polygon: CrossSection) -> Manifold:
 
 
 def _split_by_height(parts: list[Manifold]) -> list[Manifold]:
-    """Cuts the parts whose hulls add too much volume in two, up to `MOST_HULLS` parts."""
+    """Repeatedly cuts in two the part whose hull adds the most volume.
+
+    Stops when no hull adds too much volume, or at `MOST_HULLS` parts.
+    """
     parts = [part for part in parts if part.volume() >= _SMALLEST_VOLUME]
     most = ADDED_SHARE * sum(part.volume() for part in parts)
     added = [_added_volume(part) for part in parts]
@@ -144,16 +148,16 @@ def _halves(part: Manifold) -> tuple[Manifold, Manifold]:
 
 
 def _steps(shares: np.ndarray) -> list[float]:
-    """Returns positions (0 to 1) of planes with many vertices, such as a shoulder or a jaw's end.
+    """Returns the positions with many vertices, such as a shoulder or a jaw's end.
 
     Args:
-        shares: the positions (n) of the vertices, from 0 to 1.
+        shares: the positions (n) of the vertices along an axis, from 0 to 1.
     """
     within = shares[(shares > 0.08) & (shares < 0.92)]
     values, counts = np.unique(np.round(within, 3), return_counts=True)
     order = np.argsort(-counts, kind="stable")[:3]
     many = max(4, len(shares) // 50)
-    # Use the median of the vertices' exact positions instead of the rounded position.
+    # Rounding may move a position off its vertices, so use the median of their exact positions.
     return [
         float(np.median(within[np.abs(within - values[i]) <= 6e-4]))
         for i in order

@@ -17,7 +17,7 @@ from kitting_drake.hkd.tools.tool import LONGEST_MM, SHORTEST_MM, Tool
 from systems.grasp import Grasp
 
 THINNEST_MM, HIGHEST_MM = 4.0, 45.0
-"""The least and the largest height of a tool at rest."""
+"""The least and the largest height of a tool at rest, in mm."""
 
 # The number of other grasps to keep, and how much more than the best grasp they may cost.
 _OTHERS, _MUCH_WORSE = 3, 2.0
@@ -40,8 +40,8 @@ def true_length(
 ) -> tuple[float, str]:
     """Returns the length of a tool in mm, and a phrase for the user that explains it.
 
-    Meshes often have no unit. It is then assumed to be the only unit in which the hand can hold the
-    tool and a kit has room for it.
+    Many meshes do not state a unit. The unit is then taken to be the only one in which the length
+    and height of the tool are permitted.
 
     Args:
         length: the length of the tool at rest, in the unit of its file.
@@ -87,10 +87,18 @@ def fit(
     directory: Path,
     density: float | None = None,
 ) -> tuple[Tool, Manifold]:
-    """Makes a tool of a given length in mm, and writes its visual mesh.
+    """Scales a solid to the length of its tool, finds the grasps, and writes the visual mesh.
+
+    Args:
+        category: the tool's category.
+        name: the tool's name.
+        solid: the solid at rest with its length along x, in any unit.
+        length: the tool's length in mm.
+        directory: the folder for the visual mesh.
+        density: the density of the whole tool in kg/m^3; by default that of the category.
 
     Returns:
-        The tool, and its solid in mm in the tool frame T.
+        The tool, whose mass is still 0, and its solid in mm in the tool frame T.
 
     Raises:
         UserError: the hand cannot hold the tool, or a kit has no room for it.

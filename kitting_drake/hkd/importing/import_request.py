@@ -77,7 +77,7 @@ def check_request(request: ImportRequest) -> None:
         ("--frame", request.frame, FRAMES),
     ):
         if name is not None and name not in names:
-            raise UserError(f"{flag} '{name}' is not known: give {', '.join(names)}")
+            raise UserError(f"{flag} '{name}' is not known: give one of {', '.join(names)}")
     if request.unit is not None and request.mesh.suffix.lower() in IN_MM:
         raise UserError(
             f"{request.mesh} states its own unit: leave out --unit, or give --length_mm"
@@ -87,17 +87,21 @@ def check_request(request: ImportRequest) -> None:
     if is_outline(request.mesh) and request.height_mm is None:
         raise UserError(f"{request.mesh} is an outline: give the tool's height with --height_mm")
     if not is_outline(request.mesh) and request.height_mm is not None:
-        raise UserError(f"--height_mm is for outlines (SVG, DXF), and {request.mesh} is a mesh")
+        raise UserError(
+            f"--height_mm is for outlines (SVG, DXF), and {request.mesh} is a mesh: leave it out"
+        )
     if not is_outline(request.mesh) and request.frame is not None:
-        raise UserError(f"--frame is for outlines (SVG, DXF), and {request.mesh} is a mesh")
+        raise UserError(
+            f"--frame is for outlines (SVG, DXF), and {request.mesh} is a mesh: leave it out"
+        )
 
 
 def checked_name(request: ImportRequest) -> str:
     """Returns the tool's name: the requested one, or the file's.
 
     Raises:
-        UserError: the name has other characters than lower-case letters, digits and underscores, or
-            belongs to one of the project's own tools.
+        UserError: the name is too long, has other characters than lower-case letters, digits and
+            underscores, or belongs to one of the project's own tools.
     """
     if request.name is None:
         name = re.sub(r"[^a-z0-9]+", "_", request.mesh.stem.lower()).strip("_")[:60]
@@ -107,7 +111,8 @@ def checked_name(request: ImportRequest) -> str:
         name = request.name
     if not re.fullmatch(r"[a-z0-9][a-z0-9_]{0,63}", name):
         raise UserError(
-            f"--name '{name}' must consist of lower-case letters, digits and underscores"
+            f"--name '{name}' is not valid: give at most 64 lower-case letters, digits and "
+            "underscores, beginning with a letter or digit"
         )
     if name in tool_names():
         raise UserError(

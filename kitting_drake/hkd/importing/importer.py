@@ -32,7 +32,7 @@ _MAKING = ".making-"
 
 @dataclass(frozen=True)
 class ImportReport:
-    """A report on a tool that was made."""
+    """The result of `import_tool`."""
 
     directory: Path
     record: dict[str, Any]

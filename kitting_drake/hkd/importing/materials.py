@@ -38,14 +38,16 @@ _SLICES = 60
 _END = 0.3
 """The length of an end, as a share of the tool's length."""
 _STEP_WIDTH = 1.5
-"""The least ratio of the width of a head or handle to that of the shaft."""
+"""A hammer or screwdriver is split into two bodies if its head or handle is at least this many
+times as wide as its shaft."""
 
 
 def bodies_of(solid: Manifold, category: str, density: float | None = None) -> list[Body]:
     """Splits a tool in its frame T into one or two homogeneous bodies.
 
-    If their widths differ clearly, the head of a hammer or the blade of a screwdriver is one body,
-    of steel, and the handle is the other.
+    A hammer is split into a steel head and a light handle, and a screwdriver into a steel blade and
+    a light handle, if the widths along the tool show where the handle ends. Any other tool is one
+    body, and so is a tool of a given density.
 
     Args:
         solid: the tool in mm, with its working end toward +x.

@@ -15,7 +15,7 @@ from kitting_drake.hkd.importing.prepare import Prepared, prepare_tool
 TIME_LIMIT = 55.0
 """The processor time in seconds after which an import is aborted."""
 MOST_WAITING = 20.0
-"""The longest wait for one step, in wall-clock time, as a multiple of the limit of processor time.
+"""The longest wall-clock time of one step, as a multiple of `TIME_LIMIT`.
 
 It is long, because it only has to end a process that hangs, and the machine may be busy.
 """
@@ -24,7 +24,11 @@ _MOST_MEMORY = 12 * 2**30
 
 def prepare_aside(request: ImportRequest, name: str, made: Path, time_limit: float) -> Prepared:
     """Runs `prepare_tool` in a child process, which is killed after `time_limit` seconds of
-    processor time."""
+    processor time.
+
+    Raises:
+        UserError: the tool cannot be made, or the child process crashes, hangs or is killed.
+    """
     step = "starting"
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe(duplex=False)

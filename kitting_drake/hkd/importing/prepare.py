@@ -32,14 +32,14 @@ from kitting_drake.hkd.tools.symmetry import symmetry_order
 from kitting_drake.hkd.tools.tool import Tool, load_tool
 
 # If a dropped tool comes to rest tilted by more than `_SAME_POSE_DEG`, it is moved to that pose and
-# dropped again, at most `_LAYINGS` times.
+# dropped again. It is dropped at most `_LAYINGS` times in all.
 _SAME_POSE_DEG, _LAYINGS = 2.0, 3
-# A stable tool stays upright when the table is tilted by this angle, in degrees.
+# A tool made from an outline must not tip over on a table with this tilt, in degrees.
 _TIPS_DEG = 10.0
-# The hydroelastic modulus, in Pa. With the modulus of the catalogue's tools, the pads would sink
+# The hydroelastic modulus, in Pa. With the lower `sdf.HYDROELASTIC_MODULUS`, the pads would sink
 # too far into thin blades and slide up round handles.
 _MODULUS = 8e6
-# The deviation of the collision hulls from the outline above which a note reports it, in mm.
+# If the collision hulls deviate by more than this from the outline, in mm, a note reports it.
 _TRUE_OUTLINE_MM = 0.35
 Prepared = tuple[dict[str, Any], list[str], int]
 Say = Callable[[str], None]
@@ -143,7 +143,7 @@ def _prepare(request: ImportRequest, name: str, directory: Path, say: Say) -> Pr
 
 
 def _surface(request: ImportRequest) -> tuple[np.ndarray, np.ndarray, list[str]]:
-    """Returns the surface that a request describes.
+    """Reads the mesh of a request, or extrudes its outline.
 
     Returns:
         Vertices (n, 3), triangles (m, 3) and notes. The vertices of a mesh are in its own units,
@@ -183,7 +183,7 @@ def _write(
     notes: list[str],
     say: Say,
 ) -> tuple[Prepared, Manifold]:
-    """Writes the files of a solid that is in mm in the tool frame.
+    """Scales a solid in the tool frame to a length in mm, and writes the files of its tool.
 
     Returns:
         The results of `prepare_tool`, and the solid scaled to `length` mm.

@@ -3,8 +3,8 @@
 A watertight mesh is used as it is. Any other mesh is split into connected components, and each
 component is repaired separately. First its winding is repaired, then small holes and flat openings
 are closed. If this does not suffice, pymeshfix repairs the component. The components are then
-united, and sealed hollows are subtracted. If visible parts are lost, the surface is filled as
-voxels, and the surface of the voxels is traced.
+united, and sealed hollows are subtracted. If this loses visible parts, the solid is made from the
+voxels inside the surface instead.
 """
 
 import numpy as np
@@ -23,8 +23,8 @@ NOMINAL_MM = 180.0
 
 # Vertices in the same cell of a grid with this spacing are merged.
 _MERGE_MM = 1e-3
-# Bodies that are farther apart than this are separate objects. An object with less than the share
-# `_DIRT` of the volume is removed.
+# Bodies that are farther apart than `_GAP_MM` are separate objects. If all objects but the largest
+# have together at most the share `_DIRT` of the volume, they are removed.
 _GAP_MM, _DIRT = 1.5, 0.02
 # The largest share of the area of a projection along x, y or z that a repair may lose.
 _LOST = 0.03
@@ -46,7 +46,12 @@ Faces = NDArray[np.int64]
 
 
 def make_solid(vertices: Array, faces: Faces) -> tuple[Manifold, list[str]]:
-    """Makes the solid of a mesh whose longest side is `NOMINAL_MM`.
+    """Makes one solid from the triangles of a mesh.
+
+    Args:
+        vertices: the vertices (n, 3) in mm, scaled so that the longest side of their bounding box
+            is `NOMINAL_MM`.
+        faces: the triangles (m, 3).
 
     Returns:
         The solid, and notes for the user on its repairs.
@@ -276,7 +281,7 @@ def _wrapped(triangles: Array) -> Manifold:
     if filled.sum() < 1.05 * surface:
         return Manifold()
     distance = ndimage.distance_transform_edt(filled) - ndimage.distance_transform_edt(~filled)
-    # The voxels of the surface extend half a voxel beyond it.
+    # Subtract the half voxel by which the surface's voxels extend beyond it.
     field = ndimage.gaussian_filter(distance, 0.7) - 0.5
     inside = np.argwhere(field > -3)
     first, last = inside.min(axis=0), inside.max(axis=0)

@@ -44,7 +44,8 @@ def to_tool_frame(solid: Manifold, category: str) -> Manifold:
 
 
 def facing_forward(solid: Manifold, category: str) -> Manifold:
-    """Moves a solid (in mm) that rests along x into the frame T, with its working end toward +x.
+    """Moves a solid (in mm) that rests along x into the tool frame T, with its working end toward
+    +x.
 
     `to_tool_frame` says which end is the working end.
     """
@@ -65,7 +66,7 @@ def tipping_deg(solid: Manifold) -> float:
 
 
 def centred(solid: Manifold) -> Manifold:
-    """Moves a solid to T's origin: centred in its bounding box, and on the table."""
+    """Moves a solid so that its bounding box is centred at x = y = 0 and its bottom is at z = 0."""
     low, high = np.array(solid.bounding_box()).reshape(2, 3)
     middle = (low + high) / 2
     return solid.translate((-middle[0], -middle[1], -low[2]))

@@ -1,1 +1,1 @@
-"""Readers of meshes and drawings, which tolerate the deviations of many programs."""
+"""Readers of mesh and drawing files, which accept common deviations from the file formats."""

@@ -108,11 +108,13 @@ def enclosed(
         loops.pop(0)
     areas = [loop.area for loop in loops]
     if not areas or areas[0].area() < _LEAST_AREA_MM2:
-        raise UserError(f"{path} has no closed curve that encloses an area")
+        raise UserError(
+            f"{path} has no closed curve that encloses an area: close the tool's outline"
+        )
     outer, *holes = areas
     parts = sorted(outer.decompose(), key=lambda part: -part.area())
     if sum(part.area() for part in parts[1:]) > _LEAST_AREA_MM2:
-        raise UserError(f"{path}: its outline crosses itself: draw it without crossings")
+        raise UserError(f"{path} has an outline that crosses itself: draw it without crossings")
     # Drop the tiny areas that lines enclose where they overshoot a corner.
     outer = parts[0]
     for hole in holes:

@@ -27,12 +27,12 @@ Some programs write more bytes behind the end mark.
 
 
 def dxf_curves(path: Path, unit_mm: float | None = None) -> DrawnCurves:
-    """Reads the curves in a DXF's model space that are plotted.
+    """Reads the plotted curves in a DXF's model space.
 
     Args:
         path: the drawing.
-        unit_mm: the length in mm of a unit of the drawing. None takes the unit from the file
-            ($INSUNITS), or else the only unit in which the drawing has the size of a tool.
+        unit_mm: the length in mm of a unit of the drawing. None: the unit in the file's $INSUNITS;
+            if there is none, the only unit in which the drawing has the size of a tool.
 
     Raises:
         UserError: the file is broken, or its unit is ambiguous.

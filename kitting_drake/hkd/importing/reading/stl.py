@@ -73,5 +73,7 @@ def _text_triangles(data: bytes, path: Path) -> NDArray[np.float64]:
         # Some programs write decimal commas, depending on the country.
         flat = [float(number.replace(b",", b".")) for corner in corners for number in corner]
     except ValueError as error:
-        raise UserError(f"{path} cannot be read as STL: a corner must be three numbers") from error
+        raise UserError(
+            f"{path} is not valid STL: a corner is not three numbers; export it again"
+        ) from error
     return np.array(flat).reshape(-1, 3, 3)

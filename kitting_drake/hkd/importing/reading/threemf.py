@@ -70,7 +70,8 @@ def read_3mf(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     mm = _UNITS_MM.get(root.get("unit", "millimeter"))
     if mm is None:
         raise UserError(
-            f"{path} has the unit '{root.get('unit')}': give one of {', '.join(_UNITS_MM)}"
+            f"{path} has the unknown unit '{root.get('unit')}': export it in one of "
+            f"{', '.join(_UNITS_MM)}"
         )
     meshes = [
         mesh
