@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from kitting_drake.hkd.tracing.tracer import TracedTool
 
 _OUTLINE_ERROR_MM = 0.8
-"""A tool extends by less than this, in mm, beyond almost all of a traced outline that is not in
-doubt. Cavities are wider by this."""
+"""`Tool.outline_error` of a traced tool, in mm. Almost everywhere on an outline without reported
+doubts, the real tool extends beyond the outline by less than this. Cavities are wider by this."""
 
 
 def describe_trace(tracer: argparse.ArgumentParser) -> None:
@@ -33,7 +33,8 @@ def describe_trace(tracer: argparse.ArgumentParser) -> None:
         "--sheet",
         nargs="+",
         metavar="SIZE",
-        help="a4, letter, or two sides in mm (default: A4 or Letter, by its proportions)",
+        help="size of the sheet under the tools: a4, letter, or two sides in mm (default: A4 or "
+        "Letter, by its proportions)",
     )
     tracer.add_argument(
         "--height_mm",

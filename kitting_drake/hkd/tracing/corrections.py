@@ -18,7 +18,7 @@ class Corrections:
     """Polygons to add to and remove from the traced area, in order, and the sheet's corners."""
 
     steps: tuple[tuple[str, NDArray[np.float64]], ...] = ()
-    """Pairs of a verb, `add` or `remove`, and a polygon (n, 2) in mm on the picture's rulers."""
+    """Pairs of `add` or `remove`, and a polygon (n, 2) in the mm of the rulers of `trace.png`."""
     corners: NDArray[np.float64] | None = None
     """The sheet's corners (4, 2) in pixels of the photo, counter-clockwise in the picture. None:
     the corners are found automatically."""
@@ -40,7 +40,8 @@ class Corrections:
 
 
 def read_corrections(path: Path) -> Corrections:
-    """Reads a YAML list of items `add: [[x, y], ...]`, `remove: [[x, y], ...]` and `sheet: ...`.
+    """Reads a YAML list of items `add: [[x, y], ...]`, `remove: [[x, y], ...]` and `sheet: [[u, v],
+    ...]`.
 
     Raises:
         UserError: the file is missing, or is not such a list. The message names the item.

@@ -120,7 +120,8 @@ def focal_of_height(homography: Array, height: float, start_px: float, center: A
 
 
 def aspect_of_quad(corners: Array, focal_px: float, center: Array) -> float:
-    """Computes the ratio of a rectangle's side from corner 0 to 1 to its side from corner 1 to 2.
+    """Computes a rectangle's aspect ratio: its side between corners 0 and 1, divided by its side
+    between corners 1 and 2.
 
     Args:
         corners: (4, 2) the rectangle's corners in pixels.

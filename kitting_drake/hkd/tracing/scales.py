@@ -30,7 +30,7 @@ _SMALL_SIDE = 1200
 
 @dataclass(frozen=True)
 class Scale:
-    """An object of known size in the photo: `points`, `disc_mm` or `board`; the others are None."""
+    """An object of known size in the photo, given by `points`, `disc_mm` or `board`."""
 
     points: tuple[float, float, float, float] | None = None
     """Two points u1, v1, u2, v2 of the photo, in pixels, for instance on a ruler."""

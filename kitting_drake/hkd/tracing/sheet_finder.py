@@ -22,7 +22,9 @@ They are shares of the photo's longer side. Each row is one attempt, in which it
 one after the other. The second row begins with a larger distance, for an edge that a tool hides.
 """
 _CLOSE_PX = 2.5
+"""The distance in pixels up to which a point counts as on a line."""
 _SAME_QUAD = 0.02
+"""Quadrilaterals whose corners differ by less than this share of `_SMALL_SIDE` count as one."""
 
 
 @dataclass(frozen=True)
@@ -198,7 +200,8 @@ def _edge(
         start: (2,) the start of the segment in pixels.
         end: (2,) the end of the segment in pixels.
         reach: how far from the segment to search, in pixels.
-        sign: 1 or -1, the direction across the segment in which the lightness rises.
+        sign: 1 if the lightness rises in the direction (-y, x), where (x, y) is the direction of
+            the segment; -1 if it falls.
 
     Returns:
         The line (a, b, c), the share of the segment that supports it, the points (n, 2) on it, and

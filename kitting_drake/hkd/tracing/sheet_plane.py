@@ -26,6 +26,7 @@ SHEETS = {"a4": (297.0, 210.0), "letter": (279.4, 215.9)}
 _ASPECT_ERROR = 0.025
 """The largest `_aspect_error` at which the format of a sheet is recognised."""
 _GIVEN_ASPECT_ERROR = 0.06
+"""The largest `_aspect_error` of a sheet whose size the user gives."""
 _FOCALS_35MM = (22.0, 24.0, 26.0, 28.0, 31.0)
 """Typical 35 mm equivalent focal lengths of phones, for photos that do not state theirs."""
 _FOCAL_RANGE_35MM = (18.0, 90.0)
@@ -66,7 +67,8 @@ def plane_of_sheet(
     Args:
         cv2: OpenCV.
         photo: the photo.
-        size: the sheet's sides, in mm; None: A4 or Letter, by the ratio of its sides in the photo.
+        size: the sheet's sides, in mm. None: A4 if `corners` is given; else A4 or Letter, by the
+            ratio of the sides in the photo.
         corners: (4, 2) the sheet's corners in pixels; None: they are found automatically.
         camera_mm: the camera's height above the sheet, in mm; None: computed from the focal length.
 
@@ -148,10 +150,10 @@ def _choose(
 
 
 def _aspect_error(photo: Photo, corners: Array, size: tuple[float, float]) -> float:
-    """Returns the difference between the logarithms of the ratios of a sheet's sides: in the photo,
-    and in `size`.
+    """Returns the difference of a sheet's aspect ratio in the photo from that of `size`.
 
-    If the focal length is not known, this is the smallest error at any of `_FOCALS_35MM`.
+    It is the absolute difference of the logarithms. If the focal length is not known, this is the
+    smallest difference at any of `_FOCALS_35MM`.
     """
     focals = (photo.focal_35mm,) if photo.focal_35mm else _FOCALS_35MM
     wanted = math.log(max(size) / min(size))
@@ -201,7 +203,7 @@ def _lens_of_edges(
     )
 
     def bows(k1: float) -> Array:
-        """Returns the rise (4,) of each edge over its chord, in mm, after correction with k1."""
+        """Returns the sagitta (4,) of each edge in mm, after correction with k1."""
         result = []
         for points in quad.edges:
             p = (points - photo.center) / focal

@@ -154,7 +154,9 @@ def _blur_mm(cv2: Any, soft: Array, mask: Array, ppm: float) -> float:
 _BAND_MM = 0.7
 """The largest distance of the true outline from the edge of the mask, in mm."""
 _SKIP_MM = 0.35
+"""The least distance from the edge at which colours are sampled, in mm."""
 _NEAR_MM = 0.8
+"""The approximate radius, in mm, of the area over which these colours are averaged."""
 _LEAST_CONTRAST = 0.03
 
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 Array = NDArray[Any]
 
 _DARKER, _BRIGHTER, _COLOURED = 0.22, 0.12, 0.11
-"""The least differences from the ground that may be a tool, in logarithms of light: darker,
-brighter, or differently coloured."""
+"""The least differences from the ground, in logarithms of light, that may be a tool: darker,
+brighter, or of another colour."""
 _NO_SHADOW = 1.3
 """The largest darkening by a shadow, in logarithms of light."""
 _BALL_MM = 0.9
@@ -21,10 +21,13 @@ _ROUGH = 0.022
 _MOST_FINE = 0.1
 _HOLE_BALL_MM = 0.6
 _STRIP_MM = 1.2
+"""Half the width above which a shaded region, eroded by `_HOLE_BALL_MM`, counts as wide, in mm."""
 _EDGE_MM = 2.3
+"""The distance by which the ground is extended over the rough pixels at an edge, in mm."""
 _SHINE_STEEP = 0.6
 """The largest slope of the edge of a specular reflection, in logarithms of light per mm."""
 _STEP_REACH_MM = 1.5
+"""The distance from a pixel within which a step of light is measured, in mm."""
 _SHINY, _SHINY_SHARE = 0.06, 0.25
 """A bay or hole of a tool's mask is a reflection if more than `_SHINY_SHARE` of it is brighter than
 the ground by more than `_SHINY`, in logarithms of light."""
@@ -42,9 +45,11 @@ _BLENDED_MM, _SHADED = 1.2, 0.06
 """The width of a step of light, in mm, above which a tool blends into its surroundings; and the
 least darkness of a shadow, in logarithms of light."""
 _NEUTRAL = 0.05
+"""The largest difference in colour of ground in shadow, in logarithms of light."""
 _LARGEST_HOLE_MM2 = 500.0
 """The area in mm^2 above which a hole must show ground that is not in shadow."""
 _UNLIKE_SHARE = 0.3
+"""The least share of a tool's pixels that differ from the ground."""
 _LEAST_AREA_MM2 = 40.0
 _LEAST_HOLE_MM2 = 4.0
 _LEAST_HOLE_RADIUS_MM = 0.7

@@ -29,6 +29,7 @@ from kitting_drake.hkd.tracing.tool_height import outline_of_silhouette
 from kitting_drake.hkd.tracing.trace_files import outlines_dxf, outlines_svg, trace_png
 
 _STEEPEST = math.radians(30)
+"""The largest angle between the camera's optical axis and the vertical, in radians."""
 _MOST_PX_PER_MM = 5.0
 _MOST_PIXELS = 4e6
 _BLURRED_MM = 1.6
@@ -36,8 +37,9 @@ _BLURRED_MM = 1.6
 _HEIGHTS_MM = (0.5, 100.0)
 _CAMERAS_MM = (100.0, 3000.0)
 _SHARE_OF_HEIGHT = 0.5
+"""The largest height of a tool, as a share of the camera's height."""
 _DOUBTED_MM = 0.12
-"""An outline is in doubt if the area that is not clear, divided by the outline's length, exceeds
+"""An outline is in doubt if the area of its unclear regions, divided by its perimeter, exceeds
 this, in mm."""
 _MOST_DOUBTS = 4
 _APART_MM = 15.0
@@ -74,6 +76,7 @@ class TracedTool:
     outline: CrossSection
     """The outline in mm, in the plane's frame."""
     height_mm: float | None
+    """The tool's height, for which the outline is corrected. None: it is not corrected."""
     svg: Path
     doubts: tuple[Unclear, ...] = ()
     """The regions where the outline may be wrong; empty if the photo shows it clearly."""
@@ -107,7 +110,8 @@ def trace(request: TraceRequest) -> TraceReport:
     """Traces the tools of a photo and writes their outlines and a picture.
 
     Raises:
-        UserError: the photo cannot be read reliably. Nothing is written then.
+        UserError: the request is not valid, or the photo cannot be traced reliably. Nothing is
+            written then.
         MachineError: OpenCV or ezdxf is missing.
     """
     cv2 = import_extra("cv2", purpose="hkd trace", extra="camera")
@@ -144,8 +148,8 @@ def _checked(request: TraceRequest) -> str:
     name = request.name or re.sub(r"[^a-z0-9]+", "_", request.photo.stem.lower()).strip("_")[:50]
     if not re.fullmatch(r"[a-z0-9][a-z0-9_]{0,60}", name):
         raise UserError(
-            f"the name '{name}' cannot be used: give a --name of lower-case letters, digits and "
-            "underscores"
+            f"the name '{name}' is not valid: give a --name of at most 61 lower-case letters, "
+            "digits and underscores, beginning with a letter or digit"
         )
     for flag, values, (low, high) in (
         ("--height_mm", request.heights_mm, _HEIGHTS_MM),
@@ -170,7 +174,7 @@ def _check_view(photo: Photo, plane: GroundPlane) -> None:
 def _look(
     cv2: Any, photo: Photo, plane: GroundPlane, heights: tuple[float, ...]
 ) -> tuple[RectifiedPhoto, CrossSection, float, list[Unclear]]:
-    """Returns the photo as seen from above, and what `find_silhouettes` finds in it."""
+    """Returns the photo as seen from above, and the results of `find_silhouettes`."""
     seen = _rectified(cv2, plane)
     try:
         return (
@@ -246,7 +250,7 @@ def _doubts(
 
 
 def _gap_between(part: CrossSection, other: CrossSection) -> Unclear | None:
-    """Returns the gap between two silhouettes. A reflection may have split one tool into the two.
+    """Returns the gap between two close silhouettes; a reflection may have split one tool into two.
 
     Returns None if they are more than `_APART_MM` apart.
     """
@@ -292,9 +296,8 @@ def _corrected(
     parts = sorted(outline.decompose(), key=lambda piece: -piece.area())
     if not parts or parts[0].area() < 0.5 * part.area():
         raise UserError(
-            f"{photo.path}: nothing would be left of a tool {height:g} mm high after the "
-            "correction for its sides: give its true height, or take the photo from straight "
-            "above"
+            f"{photo.path}: the correction for a tool {height:g} mm high leaves less than half of "
+            "its silhouette: give its true height, or take the photo from straight above"
         )
     return parts[0]
 
