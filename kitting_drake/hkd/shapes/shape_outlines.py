@@ -1,6 +1,6 @@
 """The outlines of the project's twenty flat shapes, in mm.
 
-All are 30 to 75 mm by 45 to 60 mm in size, like the shapes of Ravens' assembling-kits task. Their
+All are 45 to 75 mm long along x and along y, like the shapes of Ravens' assembling-kits task. Their
 features are wide enough to be seen in the observation o_t, and wider than the notches that a cavity
 bridges.
 """

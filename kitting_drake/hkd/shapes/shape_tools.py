@@ -1,7 +1,8 @@
 """Makes tools from flat shapes: the project's own shapes, and the meshes in a folder.
 
-A shape lies as it was drawn, with z up. All shapes are of plastic, each in its own colour. The
-collision hulls follow the outline and keep its holes. The tools are stored in the cache.
+A shape lies as it was drawn, with z up. All shapes are of plastic, in one of six colours. The
+collision hulls follow the outline; those of a prism also keep its holes. The tools are stored in
+the cache.
 """
 
 import hashlib

@@ -22,7 +22,7 @@ _XY, _XZ, _YZ = [0, 1], [0, 2], [1, 2]
 # A first pass merges hulls whose projections change by less than this, to leave fewer hulls for the
 # search.
 _EXACT_MM = 0.03
-# The difference in area (mm^2) up to which two outlines count as equal.
+# A region counts as inside another one if at most this area (mm^2) of it lies outside.
 _AREA = 1e-4
 
 

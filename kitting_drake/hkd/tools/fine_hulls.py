@@ -21,7 +21,7 @@ NOTCH_MM = 3.0
 _HEIGHT_MM = 0.2
 """The tolerance in mm for thinning a hull's vertices; that for the outline is finer."""
 _AREA = 2e-3
-"""The difference in area (mm^2) up to which two outlines count as equal."""
+"""A region counts as inside another one if at most this area (mm^2) of it lies outside."""
 # A piece is cut at a height if the cut makes its hull smaller by more than the share `_SHARE` and
 # by more than `_VOLUME` (mm^3). `_LEVELS` is the number of heights to try, `_MOST_CUTS` the largest
 # number of cuts.

@@ -25,7 +25,7 @@ _SAME_LENGTH = 1e-9
 _EASY_MOMENT = 0.2
 """The moment about the axis through both pads that the grip holds easily, in N m."""
 _WIDEST = MAX_OPENING - 0.015
-"""The largest width of the tool's `other_grasps` after scaling, in metres."""
+"""The width in metres above which `other_grasps` of a scaled tool are dropped."""
 
 _DRAKE = "http://drake.mit.edu"
 
@@ -75,7 +75,7 @@ def weighted_tool(tool: Tool, mass: float) -> Tool:
     """Gives a tool another mass in kg; returns it unchanged if it has that mass.
 
     The distribution of the mass stays the same. The contact stiffness changes with the mass, so
-    that the tool rests as before. Grasps by which the heavier tool would turn between the pads come
+    that the tool rests as before. Grasps in which the heavier tool would turn between the pads come
     last.
 
     Raises:

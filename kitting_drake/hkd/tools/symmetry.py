@@ -22,7 +22,7 @@ MOST_SURFACE_DISTANCE_MM = 0.5
 
 MOST_OUTLINE_DEVIATION_MM = 2.0
 """The largest distance between the outlines of a symmetric tool and its rotated copy, in mm. It is
-the clearance of a cavity."""
+the default clearance of a cavity."""
 
 ORDERS = (24, 12, 10, 9, 8, 7, 6, 5, 4, 3, 2)
 """The orders to try, largest first. The largest stands for round tools."""
@@ -37,8 +37,8 @@ hollow part: it is equally far from the whole wall.
 """
 
 _REACH_MM = 0.75
-"""The largest distance in mm between the shift of the copy that best fits the surfaces and the
-shift that best fits the outlines."""
+"""The assumed largest distance in mm between the shift of the copy that best fits the surfaces and
+the shift that best fits the outlines."""
 
 Shift = NDArray[np.float64]
 

@@ -38,6 +38,7 @@ class Tool:
     """
 
     directory: Path
+    """The folder of the SDFormat model."""
     name: str
     category: str
     """One of `CATEGORIES`, or another name of lower-case letters, digits and underscores."""
@@ -54,13 +55,14 @@ class Tool:
     """The mass in kg."""
     grasp: Grasp
     visual_meshes: tuple[Path, ...]
+    """The OBJ files of the visual surface. The name of each file is its material."""
     symmetry: int = 1
     """The order of the rotational symmetry about T's z. 1 means none. 2 means that the tool may
     also lie in its cavity turned by a half turn."""
     scale: float = 1.0
     """The factor by which the meshes in the visual files are scaled."""
     other_grasps: tuple[Grasp, ...] = ()
-    """More grasps, best first, to try after the annotated grasp has failed."""
+    """More grasps, best first, to try after `grasp` has failed."""
     outline_error: float = 0.0
     """How far the real tool may extend beyond its outline, in metres, for instance because it was
     traced from a photo."""
@@ -105,8 +107,8 @@ class Tool:
     def axis(self) -> tuple[float, float] | None:
         """The point (x, y) of the axis of symmetry in T, in metres.
 
-        If the order of the symmetry is odd, this is the footprint's centroid. Otherwise it is None,
-        which stands for the middle of the bounding box.
+        If the order of the symmetry is odd and at least 3, this is the footprint's centroid.
+        Otherwise it is None, which stands for the middle of the bounding box.
         """
         if self.symmetry < 3 or self.symmetry % 2 == 0:
             return None
@@ -256,8 +258,8 @@ def check_category(category: str) -> None:
     """Raises UserError if a text is not valid as the name of a category."""
     if not re.fullmatch(r"[a-z][a-z0-9_]{0,31}", category):
         raise UserError(
-            f"category '{category}' must consist of lower-case letters, digits and underscores, "
-            f"such as {', '.join(CATEGORIES)}"
+            f"category '{category}' is not valid: give at most 32 lower-case letters, digits and "
+            f"underscores, beginning with a letter (such as {', '.join(CATEGORIES)})"
         )
 
 
