@@ -29,8 +29,8 @@ def measure_clearance(
 
     The outline is that of the tool's visual mesh. The wall is a horizontal slice of the block,
     halfway between floor and bevel. The clearance of a point of the outline is its distance from
-    the nearest wall. Points in narrow notches of the tool count; there the cavity's wall bridges
-    the notch.
+    the nearest wall. Points inside narrow notches of the tool are measured too, although the wall
+    bridges these notches.
 
     Args:
         block: the kit's block, in the kit frame K.

@@ -46,7 +46,7 @@ class Kit:
 
     @property
     def parameters(self) -> KitParameters:
-        """The template, with the block's length and width."""
+        """The kit's parameters; their length and width are those of its block."""
         return self.layout.parameters
 
     @property
@@ -69,7 +69,7 @@ def make_kit(
 
     Args:
         tools: the tools.
-        parameters: the template.
+        parameters: the parameters of the kit. `layout_kit` may choose another length and width.
         poses: the seated tools' poses, in the tools' order. If empty, `layout_kit` chooses them.
 
     Raises:

@@ -1,8 +1,9 @@
 """The layout of a kit: the size of its block, and the poses and outlines of its cavities.
 
-A toolset has at most one tool of each of the paper's categories. Its tools are placed in the slots
-of a template. Tools are nested instead if they are not a toolset, if one is too large for its slot,
-or if `always_nested` is set. The block of nested tools has the smallest size found or a given size.
+A toolset has at most one tool of each of the paper's categories. Its tools are placed in fixed
+slots, one for each category. Tools are nested (packed closely) instead if they are not a toolset,
+if one is too large for its slot, or if `always_nested` is set. The block of nested tools has the
+smallest size found or a given size.
 """
 
 import dataclasses
@@ -57,13 +58,13 @@ class KitLayout:
     """The size of a kit's block and the poses of its tools."""
 
     parameters: KitParameters
-    """The template, with the block's length and width."""
+    """The kit's parameters; their length and width are those of its block."""
     poses: tuple[CavityPose, ...]
     """The poses of the seated tools, in the tools' order."""
 
 
 def slot_pose(tool: Tool, parameters: KitParameters) -> CavityPose:
-    """Returns the pose of a tool in its category's slot.
+    """Returns the pose of a tool in its category's slot (see `SLOTS`).
 
     Raises:
         KeyError: the tool's category has no slot.

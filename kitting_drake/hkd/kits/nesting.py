@@ -54,7 +54,7 @@ class NestedShape:
     outline: CrossSection
     """The shape's outline, which keeps its distance from all other outlines."""
     keep_out: CrossSection
-    """An area that no other shape's outline may overlap; other keep-out areas may."""
+    """An area that no other shape's outline may overlap. Keep-out areas may overlap each other."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ def nest(shapes: Sequence[NestedShape], wall: float) -> Nesting | None:
     """Places shapes on the best rectangle found, or returns None if none is large enough.
 
     The best rectangle is small and nearly square. It exceeds `PREFERRED_SIDE` and `USUAL_SIDES`
-    only if there is no other. The result is deterministic.
+    only if no smaller one is found. The result is deterministic.
 
     Args:
         shapes: the shapes, at least one.

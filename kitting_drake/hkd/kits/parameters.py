@@ -14,8 +14,8 @@ _FINEST = 5e-6
 class KitParameters:
     """The parameters of a kit's block. Lengths in m."""
 
-    # The block's extents along x, y and z. A nested block has this length and width only if
-    # `fixed_size` is set.
+    # The block's extents along x, y and z. If the tools are nested (packed closely), the block is
+    # as small as possible, and has this length and width only if `fixed_size` is set.
     length: float = bounded(0.280, 0.04, 1.0)
     width: float = bounded(0.260, 0.04, 1.0)
     height: float = bounded(0.050, 0.01, 0.2)
@@ -43,13 +43,14 @@ class KitParameters:
     # The least wall thickness between two cavities, and below a cavity.
     minimum_wall: float = bounded(0.002, 0.0, 0.05)
 
-    # The wall thickness between and around nested cavities.
+    # The least wall thickness between and around nested cavities.
     nested_wall: float = bounded(0.006, 0.001, 0.05)
 
-    # Whether to nest the tools even if they fit the slots of a toolset.
+    # Whether to nest the tools even if they fit the fixed slots for the paper's four categories.
     always_nested: bool = False
 
-    # Whether a nested block has the length and width above instead of the smallest size found.
+    # Whether the block of nested tools has the length and width above instead of the smallest size
+    # found.
     fixed_size: bool = False
 
     @property

@@ -17,9 +17,10 @@ _STEP = 0.0004
 _WALL_STEP = 0.0001
 """The spacing of points along a cavity's wall, in metres."""
 _MOST_MOVE = 0.001
-"""The largest move in one round of the search for the most room, in metres."""
+"""The largest move in one round of the search in `find_seat`, in metres."""
 _ROUNDS = 12
 _SETTLED = 1e-6
+"""The search ends when a round increases the room by no more than this, in metres."""
 
 
 @dataclass(frozen=True)
