@@ -100,7 +100,7 @@ def design_kit(
 
 
 def solid(design: Design) -> Manifold:
-    """Returns the block in the frame of the files, in mm (see `in_block`)."""
+    """Returns the block as files have it: in mm, with its lower left corner at the origin."""
     parameters = design.kit.parameters
     block = build_block(design.cavities, parameters)
     for recess in design.recesses:
@@ -114,7 +114,7 @@ def solid(design: Design) -> Manifold:
 
 
 def letters(design: Design) -> Manifold:
-    """Returns the letters that fill the engraved labels, in the frame of the files, in mm."""
+    """Returns the letters that fill the engraved labels, in the frame of `solid`, in mm."""
     parameters = design.kit.parameters
     filled = Manifold()
     for recess in design.recesses:
@@ -142,7 +142,7 @@ def surface(solid: Manifold) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
 
 
 def openings(design: Design) -> list[Opening]:
-    """Returns the cavities, notches and labels of a block, in the frame of the files in mm."""
+    """Returns the cavities, notches and labels of a block, in the frame of `solid`, in mm."""
     parameters, raised = design.kit.parameters, design.outside.raised_mm
 
     def loops(outline: CrossSection) -> CrossSection:

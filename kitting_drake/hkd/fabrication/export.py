@@ -56,7 +56,7 @@ from kitting_drake.hkd.kits.parameters import KitParameters
 from kitting_drake.hkd.tools.tool import Tool, tool_names
 
 RECORD = "kit.json"
-"""The name of the file that marks a folder as a kit's."""
+"""The name of the file that describes the kit in a folder, and lists the folder's files."""
 
 _SCENARIO = """\
 # Written by `hkd kit`: the tools and the kit of this folder, for `python -m kitting_drake.run`.
@@ -75,9 +75,9 @@ class KitFiles:
 
     design: Design
     block: Manifold
-    """The block in the frame of the files, in mm."""
+    """The block from `design.solid`, in mm."""
     letters: Manifold | None
-    """The letters of a second colour, in the frame of the files, in mm. None: there are none."""
+    """The letters of a second colour from `design.letters`, in mm. None: there are none."""
     split: Split | None
     """The pieces of the block. None: the block is not split."""
     sheet: FoamSheet | None
@@ -170,7 +170,7 @@ def _check_replaceable(folder: Path) -> None:
     foreign = sorted(present - own)
     if foreign or not present:
         what = foreign[0] if foreign else "an empty folder"
-        raise UserError(f"{folder} holds {what}, which is not a kit's file: {advice}")
+        raise UserError(f"{folder} holds {what}, which `hkd kit` did not write: {advice}")
 
 
 def _write(folder: Path, made: KitFiles, parameters: KitParameters, robot: str) -> None:

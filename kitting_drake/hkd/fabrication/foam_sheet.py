@@ -22,7 +22,7 @@ MOST_KITS = 60
 """The largest number of kits on a sheet."""
 
 _MIXTURES = 40
-"""The number of packings in which the turned copies are chosen at random."""
+"""The number of packings to try in which each copy is turned or not at random."""
 _SHEET, _BLOCK = "SHEET", "BLOCK"
 _STROKES = ("#0b5fa5", "#2b8a3e", "#9c36b5", "#d9480f", "#087f5b", "#a61e4d", "#5f3dc4")
 _COLOURS = (4, 3, 6, 30, 2, 1, 150, 80)
@@ -80,7 +80,7 @@ def kit_of_dxf(name: str, text: str, height: float) -> SheetKit:
         height: the height of the kit's block, in mm.
 
     Raises:
-        UserError: `hkd kit` cannot have written the text.
+        UserError: the text is not a drawing that `hkd kit` writes.
         MachineError: ezdxf is not installed.
     """
     ezdxf = import_extra("ezdxf", purpose="DXF", extra="fabrication")

@@ -44,7 +44,7 @@ class KitRequest:
     """Names of tools, or paths of tool folders."""
     output: Path
     clearance_mm: float | None = None
-    """The clearance between a tool and its cavity's wall. None: the template's 2 mm."""
+    """The clearance between a tool and its cavity's wall. None: the default, 2 mm."""
     compensate_mm: float = 0.0
     """How much too narrow the printer or router makes cavities, on each side.
 
@@ -52,17 +52,17 @@ class KitRequest:
     simulated kit are not.
     """
     lead_in_mm: float | None = None
-    """The width of the bevel around the rims. None: the template's 1 mm."""
+    """The width of the bevel around the rims. None: the default, 1 mm."""
     fit_of: tuple[tuple[str, float], ...] = ()
     """Pairs of a tool's name or path, and this tool's clearance, which replaces `clearance_mm`."""
     stand_out_mm: float = 0.0
     """The height of the tools' tops above the block's top."""
     wall_mm: float | None = None
-    """The wall between and around the cavities. None: the template's 6 mm."""
+    """The thickness of the wall between and around the cavities. None: the default, 6 mm."""
     block_mm: tuple[float, float, float] | None = None
     """The block's length, width and height.
 
-    None: the smallest length and width that are found, and the template's height.
+    None: the smallest length and width that are found, and a height of 50 mm.
     """
     notches: bool = False
     labels: bool = False
@@ -165,7 +165,9 @@ def _lengths(request: KitRequest) -> KitParameters:
 
 
 def _clearance_of(request: KitRequest, loaded: Mapping[str, Tool]) -> dict[str, float]:
-    """Returns the clearances that are given for single tools, in metres, by the tools' names.
+    """Returns the clearances of single tools, in metres, by the tools' names.
+
+    They are those of `fit_of`, and the wider ones of tools whose outline is uncertain.
 
     Raises:
         UserError: the kit has no such tool, or a clearance is out of range.
@@ -188,7 +190,7 @@ def _clearance_of(request: KitRequest, loaded: Mapping[str, Tool]) -> dict[str, 
 def _widened(request: KitRequest, tool: Tool) -> float:
     """Returns the clearance, in metres, of a tool whose outline is uncertain.
 
-    The requested clearance is increased by the outline's error, up to the template's clearance.
+    The requested clearance is increased by the outline's error, but not beyond the default of 2 mm.
     """
     default = KitParameters().clearance
     asked = default if request.clearance_mm is None else 1e-3 * request.clearance_mm
@@ -333,7 +335,7 @@ def _describe_cavities(maker: argparse.ArgumentParser) -> None:
     room.add_argument(
         "--fit",
         choices=FITS,
-        help="the clearance by name: 0.15, 0.35 or 0.75 mm on each side",
+        help="the clearance by name: snug (0.15 mm on each side), easy (0.35) or loose (0.75)",
     )
     maker.add_argument(
         "--fit_of",
@@ -348,8 +350,8 @@ def _describe_cavities(maker: argparse.ArgumentParser) -> None:
         type=float,
         default=0.0,
         help="how much too narrow your printer or router makes cavities, on each side. It is "
-        "half the difference between 20 mm and the printed hole of test_piece.stl (default: "
-        "0)",
+        "half the difference between 20 mm and the side of the printed hole of test_piece.stl "
+        "(default: 0)",
     )
     maker.add_argument(
         "--stand_out_mm",
@@ -384,7 +386,7 @@ def _describe_block(maker: argparse.ArgumentParser) -> None:
         "--base",
         choices=("flat", "gridfinity"),
         default="flat",
-        help="gridfinity: sides and feet for its grid of 42 mm (default: flat)",
+        help="gridfinity: with sides and feet for Gridfinity's grid of 42 mm (default: flat)",
     )
     maker.add_argument(
         "--chamfer_mm", type=float, default=0.0, help="the bevel of the outer edges (default: 0)"

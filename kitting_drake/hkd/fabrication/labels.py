@@ -25,7 +25,7 @@ _CELL = 0.0007
 _FARTHEST = 0.03
 """The largest distance of a label from its cavity, in metres."""
 _PLAINLY = 1.5
-"""A label's distance from other cavities must exceed this multiple of that from its own cavity."""
+"""A label must be farther from other cavities than from its own, by at least this factor."""
 # The cost of a label's position, in metres, is the sum of: its distance from the cavity; a tenth of
 # its distance from the cavity's middle; 6 mm if the text is rotated; and minus 6 times the height
 # of its letters.

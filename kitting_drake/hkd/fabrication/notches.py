@@ -24,10 +24,8 @@ _SLIDES = tuple(sign * step for step in np.arange(0.0, 0.041, 0.004) for sign in
 _SHARES = (0.85, 1.15)
 """The least and largest area of a notch outside its cavity, as shares of a half disc's area."""
 _FINS = 1.6
-"""The largest area that the test for thin fins in `_notch` may find.
-
-It is given as a multiple of the area that the test finds at two right-angled corners without fins.
-"""
+"""A notch is refused if the test for thin fins in `_notch` finds a larger area than this multiple
+of the area that it finds at two right-angled corners without fins."""
 _OVERLAP = 0.001
 """The overlap of a notch with its cavity, in metres, so that no thin skin is left between them."""
 

@@ -1,4 +1,5 @@
-"""Finds what a printer cannot make of a block: walls thinner than its nozzle, and undercuts."""
+"""Finds the parts of a block that a printer cannot make: walls thinner than its nozzle, and
+undercuts."""
 
 import itertools
 from collections.abc import Iterator, Sequence
@@ -55,7 +56,7 @@ def undercut_notes(solid: Manifold, design: Design) -> list[str]:
     """Returns a sentence for each tool whose cavity is partly covered by an overhang.
 
     Args:
-        solid: the block in the frame of the files, in mm.
+        solid: the block from `design.solid`, in mm.
         design: the block's design.
     """
     mesh = solid.to_mesh64()

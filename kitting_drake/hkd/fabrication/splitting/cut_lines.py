@@ -40,7 +40,7 @@ _ROOMY = 4.0
 _STEEPEST = 4
 """The largest sideways step of a cut for each step forward, in cells."""
 _UPRIGHT_ENDS = 6.0
-"""The length, in mm, of both ends of a cut that is perpendicular to the block's sides."""
+"""Over this length from each of its ends, in mm, a cut is perpendicular to the block's side."""
 _REPAIRS = 8
 """The largest number of attempts to find cuts that leave no thin wall."""
 _BARRED = 400.0
@@ -119,7 +119,9 @@ def _counts(
 
 
 def _windows(side: float, room: float, count: int) -> list[tuple[float, float]]:
-    """Returns the range of each cut, in mm, in which all pieces with their dovetails fit the bed.
+    """Returns, for each cut, the range of positions at which all pieces fit the bed, in mm.
+
+    The pieces' dovetails must fit the bed, too.
 
     Args:
         side: the side of the block to divide, in mm.

@@ -111,7 +111,7 @@ def _spread(
 
     Args:
         places: the places along the seam that have room for a dovetail.
-        taken: the joints of other pieces.
+        taken: the joints that are already placed between other pieces.
         regions: see `choose_joints`.
         feet: see `choose_joints`.
     """

@@ -17,7 +17,7 @@ _SHARPEST = math.radians(42)
 
 @dataclass(frozen=True)
 class Opening:
-    """A recess, in mm in the frame of the files."""
+    """A recess in a block, in mm. The origin is the lower left corner of the block's bottom."""
 
     outline: CrossSection
     """The outline of the recess at the block's top, including the bevel."""
