@@ -57,7 +57,7 @@ class HammerParameters:
     handle_material: str = "hickory"
     grip_material: str = "painted_wood"
     # Other kinds of hammers have `front`, `back` and `shaft`, which replace the face, the claw and
-    # the handle above. Each of these is given as an object or as a mapping of the object's fields.
+    # the handle above. Each of these is a HeadEnd or a Shaft, or a mapping of its fields.
     front: HeadEnd | dict[str, Any] | None = None
     back: HeadEnd | dict[str, Any] | None = None
     shaft: Shaft | dict[str, Any] | None = None

@@ -41,7 +41,7 @@ table.
 _SEGMENTS = 36
 _SECTORS = 12
 _ROUND = 24
-"""The order of rotational symmetry that a round part is given."""
+"""The order of rotational symmetry that stands for a round part."""
 _PAD = 17.6
 """The length of the jaws' pads."""
 _INNER_REACH = 58.0
@@ -83,7 +83,10 @@ def ring(outer: float, inner: float, height: float) -> PartDesign:
     across its rim.
     """
     if not 2.0 <= inner <= outer - 4.0:
-        raise PartError(f"the bore must be 2 to {outer - 4:g} mm wide, and is {inner:g} mm")
+        raise PartError(
+            f"the bore of {inner:g} mm must be at least 2 mm wide, and at least 4 mm narrower than "
+            f"the ring of {outer:g} mm"
+        )
     big, small = outer / 2, inner / 2
     profile = CrossSection([circle(big, segments=_SEGMENTS)]) - CrossSection(
         [circle(small, segments=_SEGMENTS)]
@@ -168,7 +171,10 @@ def bolt(length: float, diameter: float) -> PartDesign:
     # The fingertips reach 10 mm below the top. Keep the head below them.
     head = min(0.65 * diameter, length - 11.0)
     if head < 2.0:
-        raise PartError(f"a standing bolt must be at least 13 mm long, and is {length:g} mm")
+        raise PartError(
+            "a standing bolt must be at least 13 mm long and 3.1 mm thick, and is "
+            f"{length:g} by {diameter:g} mm"
+        )
     hexagon = _hexagon(1.6 * diameter)
     shank = circle(diameter / 2, segments=24)
     lower, upper = _prism(hexagon, head), plate(shank, head - 0.2, length, _BEVEL, [_around(shank)])
@@ -252,7 +258,9 @@ def bracket(length: float, width: float, height: float) -> PartDesign:
     # The fingers close beside the short leg.
     x = min(_middle_of_mass(parts)[0], length / 2 - thick - 12.0)
     if x < -length / 2:
-        raise PartError(f"the long leg of {length:g} mm is too short for the jaws")
+        raise PartError(
+            f"the long leg must be at least {thick + 12:g} mm long, and is {length:g} mm"
+        )
     return PartDesign(parts, PartGrasp(thick, height, x, (thick - width) / 2), 1)
 
 

@@ -59,8 +59,8 @@ class PliersParameters:
     steel_material: str = "steel"
     rivet_material: str = "polished_steel"
     grip_material: str = "red_grip"
-    # Other kinds of pliers have `jaws` and `levers`, or are `locking` pliers. Each of these is
-    # given as an object or as a mapping of its fields, and replaces the fields above.
+    # Other kinds of pliers have `jaws` and `levers`, or are `locking` pliers. These replace the
+    # fields above. Each of them is a Jaws, Levers or Locking, or a mapping of its fields.
     jaws: Jaws | dict[str, Any] | None = None
     levers: Levers | dict[str, Any] | None = None
     locking: Locking | dict[str, Any] | None = None

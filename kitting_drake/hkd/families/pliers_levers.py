@@ -34,12 +34,12 @@ class Levers:
     origin."""
 
     thickness_mm: float = 12.0
-    # The width across the parallel flanks of the joint, and the lengths of the joint behind and in
-    # front of the rivet.
+    # The width across the parallel flanks of the joint, and its length behind the rivet.
     joint_width_mm: float = 28.0
     joint_back_mm: float = 22.0
     # The distance behind the rivet up to which the handles continue in line with the flanks.
     parallel_mm: float = 44.0
+    # The length of the joint in front of the rivet.
     joint_front_mm: float = 9.0
     # The distance from the rivet to the end of the handles.
     handle_length_mm: float = 130.0

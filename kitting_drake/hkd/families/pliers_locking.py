@@ -32,7 +32,7 @@ class Locking:
     thickness_mm: float = 15.0
     jaw_thickness_mm: float = 11.0
     flank_width_mm: float = 38.0
-    # The depths of the body and of the handle, as seen from above.
+    # The extents of the body and of the handle along y.
     body_depth_mm: float = 15.0
     handle_depth_mm: float = 12.0
     # The distance between the outer edges of the body and of the handle at the end of the tool.

@@ -1,4 +1,4 @@
-"""Blades of screwdrivers that are not flat: shaft and tip in one piece, along x."""
+"""Screwdriver blades with tips other than the flat one: shaft and tip in one piece, along x."""
 
 from collections.abc import Callable
 

@@ -34,7 +34,8 @@ class WrenchParameters:
     shank_width_back_mm: float = 15.0
     shank_thickness_mm: float = 7.8
     blend_radius_mm: float = 16.0
-    # The sideways offset of each end of an S-shaped shank.
+    # The sideways distance of each bend of an S-shaped shank from the line between the heads; 0 for
+    # a straight shank.
     swing_mm: float = 0.0
     # The depth of the recessed panel on each broad side of the shank (negative: the height of a
     # raised panel), and the panel's width as a share of the shank's width.
