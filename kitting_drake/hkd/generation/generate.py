@@ -207,7 +207,7 @@ def _tool_frame(
     R_TD = rest_rotation(np.vstack(hulls), 1e3 * center)
     whole = _moved(Manifold.batch_boolean([p.solid for p in parts], OpType.Add), R_TD, np.zeros(3))
     if sum(body.volume() > 1e-3 for body in whole.decompose()) != 1:
-        raise CatalogueError(f"tool {entry.name}: its parts do not touch")
+        raise CatalogueError(f"tool {entry.name}: its parts do not touch: change its parameters")
     box = np.array(whole.bounding_box()).reshape(2, 3)
     bottom = min((h @ R_TD.T)[:, 2].min() for h in hulls)
     p_T = -np.array([*box[:, :2].mean(axis=0), bottom])

@@ -188,9 +188,10 @@ class _Warp:
     stretch: Array
     """The factors (2,) along y and z."""
     splay: float
-    """The factor by which the end toward +x is wider than the middle, minus 1."""
+    """The share by which the end toward +x is wider than the middle, and the other end narrower."""
     bend: Array
-    """The coefficients (2,) of u^2 and u^3, where u is -1 and 1 at the ends of the tool."""
+    """The sideways offset is bend[0] u^2 + bend[1] u^3, in half lengths of the tool. At the ends of
+    the tool, u is -1 and 1."""
 
     @classmethod
     def draw(cls, solid: Manifold, rng: np.random.Generator) -> "_Warp":

@@ -21,7 +21,7 @@ _FORMAT_VERSION = "1"
 """The version of the files in the cache. Increase it when equal tools give different grasps."""
 _FILE = "grasps.json"
 _EASY_MOMENT = 0.18
-"""The moment about the axis through both pads that the grip holds easily, in N m."""
+"""The moment about the axis through both pads that the grip easily withstands, in N m."""
 _WORST = 12.5
 """The cost (`GraspProposal.cost`) above which proposals are left out."""
 
@@ -61,10 +61,10 @@ def all_grasps(tool: Tool) -> tuple[Grasp, ...]:
 def carrying_grasps(tool: Tool) -> tuple[Grasp, ...]:
     """Returns the grasps by which to carry a tool, best first.
 
-    A heavy tool that is gripped far from its centre of mass turns between the pads. If the tool's
-    annotated grasp avoids this, the tool's own grasps are returned. Otherwise the grasps of
-    `all_grasps` are returned, ordered by how much the moment of the tool's weight about the pads
-    exceeds `_EASY_MOMENT`.
+    A heavy tool that is gripped far from its centre of mass turns between the pads. If the weight's
+    moment about the pads is at most `_EASY_MOMENT` at the annotated grasp, the tool's own grasps
+    are returned. Otherwise the grasps of `all_grasps` are returned, sorted by how much the moment
+    exceeds `_EASY_MOMENT`, the least excess first.
 
     Raises:
         UserError: as for `all_grasps`.

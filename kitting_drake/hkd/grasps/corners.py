@@ -43,8 +43,7 @@ def corner_cost(left: Array, right: Array, column: float, touch: float) -> float
             the left pad, in metres.
         right: (columns, levels) the same coordinate of the surface under the right pad.
         column: the length of a column, in metres.
-        touch: the depth behind the foremost point, in metres, up to which a flat face touches a
-            pad.
+        touch: a pad touches a flat face up to this depth behind its foremost point, in metres.
     """
     behind = [(left.max() - left).min(axis=1), (right - right.min()).min(axis=1)]
     spans = [column * np.flatnonzero(depth <= _SOFT) for depth in behind]

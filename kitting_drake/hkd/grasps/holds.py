@@ -107,7 +107,7 @@ def find_holds(
     Args:
         reach: the extents of the tool.
         centres: (n) the columns to try; the pads' middle is at the lower edge of a column.
-        touch: the depth behind the foremost point up to which a pad touches, in metres.
+        touch: a pad touches the surface up to this depth behind its foremost point, in metres.
         planner: the planner's parameters; the pads' depth and their clearance to the table are
             used.
         corners: whether a corner may be held.
@@ -181,14 +181,15 @@ def _between_fingers(
 def _contact(
     touch_left: NDArray[np.bool_], touch_right: NDArray[np.bool_], at_corner: bool
 ) -> tuple[float, float]:
-    """Returns the mean number of levels that touch, and the offset between the pads' contacts.
+    """Returns the mean number of levels at which a pad touches, and the twist.
 
-    The offset is that of the mean points of contact along the pads, in metres.
+    The twist is the distance along the pads from the right pad's mean point of contact to the left
+    pad's, in metres.
 
     Args:
         touch_left: (columns, levels) where the left pad touches.
         touch_right: (columns, levels) where the right pad touches.
-        at_corner: whether the pads touch in different columns.
+        at_corner: whether the tool is held at a corner; the pads may touch in different columns.
     """
     columns_left, columns_right = touch_left.any(axis=1), touch_right.any(axis=1)
     if not at_corner:
