@@ -116,7 +116,7 @@ def import_mesh(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
     with Console(stderr=True, quiet=args.quiet).status(f"importing {escape(str(args.mesh))}"):
         report = import_tool(request)
     d = report.record
-    held = f"held by {1e3 * d['grasp']['width']:.1f} mm"
+    held = f"{1e3 * d['grasp']['width']:.1f} mm wide at the grasp"
     console.print(f"{d['name']}: {size_text(d)} mm, {1e3 * d['mass']:.0f} g, {held}")
     for note in report.notes:
         console.print(f"  {note}")
@@ -275,7 +275,7 @@ def main() -> int:
                 "--models", type=Path, default=MODELS, help="the folder with package.xml and tools/"
             )
         if name != "list":
-            verb.add_argument("--quiet", action="store_true", help="print nothing")
+            verb.add_argument("--quiet", action="store_true", help="print nothing but errors")
         if name == "sheet":
             verb.add_argument("--output", type=Path, required=True, help="the PNG to write")
             verb.add_argument(
@@ -292,7 +292,7 @@ def main() -> int:
         default="sdf",
         help="mjcf: also write MuJoCo models beside the SDFormat ones",
     )
-    builder.add_argument("--quiet", action="store_true", help="print nothing")
+    builder.add_argument("--quiet", action="store_true", help="print nothing but errors")
     builder.set_defaults(function=build)
     annotator = verbs.add_parser("annotate", help=annotate.__doc__)
     annotator.add_argument("name", metavar="NAME", help="a tool's name, or its folder")
@@ -341,7 +341,7 @@ def _describe_import(importer: argparse.ArgumentParser) -> None:
     importer.add_argument(
         "--frame",
         metavar="WHAT",
-        help="page or tool: the meaning of a rectangle that encloses all other curves of a drawing",
+        help="page or tool: what a rectangle around all other curves of a drawing is",
     )
     importer.add_argument("--mass_g", type=float, help="the weighed mass of the tool in grams")
     importer.add_argument(

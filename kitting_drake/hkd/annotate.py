@@ -108,7 +108,7 @@ def with_grasp(catalogue: str, name: str, grasp: Grasp) -> str:
     """Returns the catalogue's text with a new grasp for one tool, and all else unchanged.
 
     Raises:
-        UserError: the catalogue has no such tool.
+        UserError: the catalogue has no such tool, or its grasp is not on one line.
     """
     entry = re.compile(
         rf"(^  - name: {re.escape(name)}\n(?:(?!  - name:).*\n)*?    grasp: )\{{.*\}}", re.M
@@ -119,7 +119,10 @@ def with_grasp(catalogue: str, name: str, grasp: Grasp) -> str:
     )
     changed, count = entry.subn(lambda match: match[1] + text, catalogue)
     if count != 1:
-        raise UserError(f"the catalogue has no tool '{name}' with its grasp on one line")
+        raise UserError(
+            f"the catalogue has no tool '{name}', or its grasp is not on one line, as in "
+            "grasp: {x_mm: 0, y_mm: 0, theta_deg: 0}"
+        )
     return changed
 
 
@@ -286,7 +289,7 @@ def annotate(name: str, console: Console) -> None:
         meshcat = Meshcat(MeshcatParams(host="localhost", show_stats_plot=False))
     except RuntimeError as error:
         raise UserError(
-            "Meshcat found no free port from 7000 to 7099: close other Meshcat pages"
+            "Meshcat found no free port from 7000 to 7099: stop other programs that use Meshcat"
         ) from error
     page = AnnotationPage(tool, proposals, meshcat)
     console.print(
@@ -311,4 +314,4 @@ def _save_and_tell(tool: Tool, grasp: Grasp | None, console: Console) -> None:
     except UserError as error:
         console.print(f"not saved: {error}")
     else:
-        console.print(f"saved: {', '.join(_numbers(grasp))} (x, y, rotation, width)")
+        console.print(f"saved: {', '.join(_numbers(grasp))} (x, y, rotation, width; mm, deg)")

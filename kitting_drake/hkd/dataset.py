@@ -36,10 +36,10 @@ def build_dataset(
         The manifest.
 
     Raises:
-        UserError: the folder is not empty or cannot be written.
+        UserError: `folder` is a file, is not empty or cannot be written.
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise UserError(f"{folder} is not empty: give another --output, or delete it")
+        raise UserError(f"{folder} is not an empty folder: give another --output, or delete it")
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".building-") as scratch:

@@ -22,7 +22,8 @@ from kitting_drake.common.errors import UserError
 
 _DRAKE = "{http://drake.mit.edu}"
 _TORSION, _ROLLING = 0.002, 0.0001
-"""MuJoCo's default torsional and rolling friction in m. Drake models neither."""
+"""Torsional and rolling friction in m, which Drake does not model. MuJoCo's defaults are 0.005 and
+0.0001."""
 _LEVEL = 1e-5
 """The difference below which two heights of a block count as equal, in m."""
 _TOLERANCE = 5e-5

@@ -1,4 +1,4 @@
-"""The flags of `hkd kit` that prove a kit in simulation."""
+"""The flags of `hkd kit` that test a kit in simulation (`--prove`)."""
 
 import argparse
 import os
@@ -32,7 +32,7 @@ def describe_proof(maker: argparse.ArgumentParser) -> None:
     maker.add_argument(
         "--workers",
         type=count_type,
-        help=f"number of parallel processes of --prove ({os.cpu_count()})",
+        help=f"number of parallel processes for --prove (default: {os.cpu_count()})",
     )
 
 
@@ -45,7 +45,7 @@ def _pair(text: str) -> tuple[str, str]:
 
 
 def tools_to_prove(tools: Sequence[str], given: Sequence[tuple[str, str]]) -> list[str]:
-    """Returns the folders of the tools to put into the cavities of a kit in its proof.
+    """Returns the folders of the tools that `--prove` puts into the cavities of a kit.
 
     Args:
         tools: the kit's tools, as named on the command line.
@@ -55,7 +55,7 @@ def tools_to_prove(tools: Sequence[str], given: Sequence[tuple[str, str]]) -> li
         A folder for each of `tools`; an empty list if `given` is empty.
 
     Raises:
-        UserError: a tool does not exist, or a name is not that of a tool of the kit.
+        UserError: a tool does not exist, or the kit has no tool of a name in `given`.
     """
     if not given:
         return []

@@ -62,9 +62,15 @@ _LIGHTS = [
 def camera_pose(
     target: np.ndarray, azimuth_deg: float, elevation_deg: float, distance: float
 ) -> RigidTransform:
-    """Returns the pose X_WC of a camera that looks at `target` from a given side.
+    """Returns the pose X_WC of a camera that looks at the point `target`, in metres.
 
-    The camera's z axis points forward, and its y axis points down. Lengths are in metres.
+    The camera's z axis points forward, and its y axis points down.
+
+    Args:
+        target: (3,) the point in the world.
+        azimuth_deg: the direction from the target to the camera, about world z from +x.
+        elevation_deg: the angle of this direction above the horizontal.
+        distance: the distance between camera and target, in metres.
     """
     a, e = np.radians([azimuth_deg, elevation_deg])
     toward = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
