@@ -26,6 +26,7 @@ SLIPPED = "slipped"
 MISPLACED = "misplaced"
 
 _EMPTY_MODES = ("APPROACH", "DESCEND", "CLOSE")
+"""The planner's modes in which the hand has not grasped an object yet."""
 
 TABLE = ((0.0, -0.75), (1.0, 0.75))
 """Lower and upper (x, y) corners of the table in the world, in metres. The table's top is at z =
@@ -127,15 +128,16 @@ class Scene:
 
 @dataclass(frozen=True)
 class PeakForce:
-    """The largest contact force on the hand during an action, without the weight of the held
-    object, as means over 1/64 s. See `systems.contact_guard.ContactGuard`."""
+    """The largest contact force on the hand during an action, averaged over 1/64 s. It does not
+    include the weight of the held object. See `systems.contact_guard.ContactGuard`."""
 
     vertical: float
     """The vertical force, in N."""
     lateral: float
     """The lateral force, in N."""
     mode: str
-    """The mode of the planner in which the larger of the two forces occurred."""
+    """The planner's mode (`systems.pick_place_parameters.Mode`) in which the larger of the two
+    forces occurred."""
 
 
 @dataclass
@@ -161,11 +163,11 @@ class ActionRecord:
     """Angle between the pick and the nearest annotated grasp, modulo half rotations: 0 to 90
     degrees."""
     place_position_error_mm: float | None
-    """Distance between the object's middle and its goal, in mm, if the object moved rigidly with
-    the hand from pick to place; None if the object can fill no goal."""
+    """Predicted distance between the object's middle and its goal, in mm, for an object that moves
+    rigidly with the hand from pick to place; None if the object can fill no goal."""
     place_angle_error_deg: float | None
-    """Heading error, modulo the object's symmetry, if the object moved rigidly with the hand: 0 to
-    180 degrees."""
+    """Predicted heading error, modulo the object's symmetry, for the same motion: 0 to 180
+    degrees."""
     peak_force_n: PeakForce | None = None
     """The largest contact force during the action; None before a force is known."""
 
@@ -177,7 +179,7 @@ class TaskConfig:
     """
 
     causes: tuple[str, ...] = (MISSED_GRASP, SLIPPED, MISPLACED, NEVER_PICKED)
-    """The possible results of `find_cause`, in the order of tables."""
+    """The possible results of `find_cause`, in the order in which tables list them."""
     not_perturbed: tuple[str, ...] = ()
     """Names of perturbations (see `--perturb`) that do not apply, because they would change the
     task."""

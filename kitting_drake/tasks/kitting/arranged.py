@@ -67,7 +67,8 @@ class ArrangedKitting(KittingTask):
 
     @staticmethod
     def _check_workspace(scene: Scene, grid: PixelGrid) -> None:
-        """Raises UserError if a pick or place is outside the workspace, where o_t is unknown."""
+        """Raises UserError if a pick or place is outside the workspace, beyond which policies
+        see nothing."""
         things = {f"task.tools.{item.name}": item.X_WB for item in scene.objects}
         for goal in scene.goals:
             name = scene.objects[goal.objects[0]].name

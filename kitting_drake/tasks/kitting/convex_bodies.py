@@ -17,7 +17,7 @@ _SLAB = 0.02
 _LEAST_VOLUME = 1e-9
 """Pieces with a volume below this, in m^3, are left out."""
 _THINNED_MM = 0.2
-"""To simplify pieces, their corners are moved by up to this, in mm."""
+"""Pieces are simplified so that their surfaces move by no more than about this, in mm."""
 _MASS = 0.1
 """The mass that is assumed for a tool without a mass, in kg. The resting pose hardly depends on
 it."""

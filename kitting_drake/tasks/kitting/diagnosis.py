@@ -44,7 +44,7 @@ def find_cause(
 ) -> str:
     """Returns why a tool was not placed, one of `CAUSES`.
 
-    - `never picked`: no action on the tool was completed.
+    - `never picked`: no attempt to grasp the tool was completed.
     - `missed grasp`: no grasp of the tool held.
     - `reversed`: the tool is at its cavity, but rotated by 180 degrees or on the wrong side.
     - `insertion blocked`: the tool is over its cavity, but protrudes or is displaced.
@@ -104,7 +104,7 @@ def _is_over(p_WMiddle: np.ndarray, X_WB: RigidTransform, X_WGoal: RigidTransfor
 
 
 def _is_over_kit(scene: Scene, p_WPoint: np.ndarray) -> bool:
-    """Whether a point is over any kit, which is the bounding box of all its seated tools plus a
+    """Whether a point is over a kit. A kit's area is the bounding box of its seated tools plus a
     border."""
     return any(_is_over_one(scene, kit, p_WPoint) for kit in {goal.fixture for goal in scene.goals})
 

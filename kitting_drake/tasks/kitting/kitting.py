@@ -422,8 +422,8 @@ class ToolsetKitting(_DrawnKitting):
 
 
 def _longest(tool: Tool, kit: KitParameters) -> float:
-    """The largest length to which a tool can be scaled so that it can still be held and kitted, in
-    metres."""
+    """The largest length, in metres, to which a tool can be scaled. It then still fits the jaws and
+    the kit's height, and weighs at most `HEAVIEST` kg."""
     factor = min(
         (MAX_OPENING - _JAW_MARGIN) / tool.grasp.width,
         (kit.height - kit.minimum_wall) / tool.height,

@@ -47,7 +47,8 @@ _STILL = 4
 """Bodies are at rest if they pass this many checks in a row, as in `RestDetector`. Velocities are
 not checked, because a flat body on a plane may chatter without changing its place."""
 _POSITION, _ANGLE = 0.0003, 0.01
-"""A body passes a check if its pose has changed by less than this, in m and rad."""
+"""A body passes a check if its pose has changed by less than this, in m and rad, since the last
+check that it failed."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +91,7 @@ def settle(
 
     Args:
         models: the n bodies.
-        poses: X_WB of each of the n bodies at the start, where they are at rest.
+        poses: X_WB of each of the n bodies at the start; their velocities are zero.
         still: bodies on the table that do not move.
         longest: limit of the simulated time, in s.
         goes_on: a function that gets the poses at regular intervals and returns whether to

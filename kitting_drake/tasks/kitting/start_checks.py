@@ -36,8 +36,8 @@ _UPRIGHT = math.cos(math.radians(60.0))
 _ON_KIT = 0.002
 """A point at least this far inside the block's outline, in metres, counts as on the kit."""
 _NEAR_GRASP = 0.035
-"""Touching tools must be graspable one after another, each at a free grasp within this distance, in
-m, of its annotated grasp."""
+"""Touching tools must be graspable one after another. Each needs an unobstructed grasp within this
+distance, in m, of its annotated grasp."""
 _LEANS = math.radians(5.0)
 """A tool tilted by more than this, in radians, counts as leaning."""
 
@@ -53,13 +53,16 @@ class Start:
 
 
 def surface_of_box(size: Sequence[float]) -> NDArray[np.float64]:
-    """(m, 3) points of the surface of a box whose bottom's middle is the origin, in metres."""
+    """(m, 3) points of the surface of a box, in metres. The origin is the middle of its bottom."""
     length, width, height = size
     return box_points((length, width, height))
 
 
 class StartCheck:
-    """Checks the poses of tools before, during and after they settle."""
+    """Checks the poses of tools before, during and after they settle.
+
+    The arguments are those of `draw_start`; `drawn` has the poses from which the tools settle.
+    """
 
     def __init__(
         self,

@@ -95,7 +95,7 @@ def draw_start(
             without cavities.
 
     Raises:
-        UserError: no such start was found.
+        UserError: no such start was found, or `kind` needs more tools.
     """
     if kind in ("touching", "crossed") and len(tools) < 2:
         raise UserError(f"task.start: '{kind}' needs at least two tools")
@@ -131,9 +131,10 @@ def draw_unsettled(
     spacing: float,
     rng: np.random.Generator,
 ) -> Start:
-    """Draws a start without a simulation. The tools are at rest only if they lie side by side.
+    """Draws a start without a simulation.
 
-    For the arguments see `draw_start`.
+    With the kinds `apart` and `touching`, the tools lie flat on the table. With the other kinds,
+    they are not at rest. For the arguments see `draw_start`.
 
     Raises:
         UserError: there is no room.

@@ -57,4 +57,7 @@ def check_count(count: int, kits: int = 1) -> None:
     if not count:
         raise ValueError("task.tools is empty: name at least one tool")
     if count > kits * MOST_TOOLS:
-        raise ValueError(f"task.tools has {count} tools: a kit holds up to {MOST_TOOLS}")
+        raise ValueError(
+            f"task.tools has {count} tools: name at most {kits * MOST_TOOLS}, because a kit holds "
+            f"up to {MOST_TOOLS}"
+        )

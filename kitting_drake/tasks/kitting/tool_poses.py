@@ -22,7 +22,7 @@ _RESTARTS = 60
 _DISTRACTOR_SPACING = 0.01
 """Least distance of a drawn box from anything else, in metres."""
 _MANY = 6
-"""If there are more tools than this, the tools that are hardest to place are drawn first."""
+"""If there are more tools than this, large tools are drawn before small ones."""
 
 
 @dataclass
@@ -49,7 +49,7 @@ class _Footprint:
     outline: CrossSection
     fingers: CrossSection
     palm: CrossSection
-    """The area of the palm, which is above the tools but not above the kit block."""
+    """The area of the palm. At a grasp, the palm passes over other tools, but not over a kit."""
 
     def moved(self, pose: TablePose) -> "_Footprint":
         return _Footprint(
@@ -96,8 +96,8 @@ def check_arrangement(
         if (outline - table).area() > 1e-9:
             (x_min, y_min), (x_max, y_max) = TABLE
             raise UserError(
-                f"{name} extends beyond the table: choose x from {x_min:g} to {x_max:g} m and "
-                f"y from {y_min:g} to {y_max:g} m"
+                f"{name} extends beyond the table: keep all of it within x from {x_min:g} to "
+                f"{x_max:g} m and y from {y_min:g} to {y_max:g} m"
             )
         for other, standing in placed.items():
             if _overlap(outline, standing):
@@ -235,7 +235,7 @@ def draw_boxes(
     grid: PixelGrid,
     rng: np.random.Generator,
 ) -> list[DrawnBox]:
-    """Draws boxes without a cavity, of random size and colour.
+    """Draws boxes of random size and colour, for which the kits have no cavities.
 
     The boxes keep clear of the kit, the tools, and the hand at each grasp. If there is not enough
     room, there are fewer than `count`.

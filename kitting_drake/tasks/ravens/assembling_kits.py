@@ -52,7 +52,7 @@ def _kit() -> KitParameters:
 
 @dataclass
 class AssemblingKits(PoseTask):
-    """Five flat shapes are put into the cavities of a kit, which are hollow here.
+    """Five flat shapes are put into the cavities of a kit, which are hollow, unlike in Ravens.
 
     Each episode draws the shapes, their places in the kit, and all poses. Success is measured as in
     Ravens. The results also contain ADD-S, and the success by the measure of ManiSkill's task of
