@@ -50,7 +50,7 @@ def test_models_load_after_the_folder_is_moved(tmp_path: Path):
 
 def test_a_folder_with_files_is_rejected_and_kept(tmp_path: Path):
     (tmp_path / "mine.txt").write_text("mine")
-    with pytest.raises(UserError, match="not empty"):
+    with pytest.raises(UserError, match="not an empty folder"):
         dataset.build_dataset(tmp_path, lambda done, total: None)
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
 
