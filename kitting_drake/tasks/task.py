@@ -257,8 +257,10 @@ class TaskConfig:
 def last_action_on(name: str, records: Sequence[ActionRecord]) -> ActionRecord | str:
     """Returns the last action in which the hand held an object, or the cause of the failure if
     there is none."""
-    grasped = [item for item in records if item.outcome not in ("unfinished", "pressed")]
-    own = [item for item in grasped if item.object == name]
+    attempted = [
+        item for item in records if item.outcome not in ("unfinished", "pressed", "unreachable")
+    ]
+    own = [item for item in attempted if item.object == name]
     held = [item for item in own if item.outcome != "missed" and not _stopped_empty(item)]
     if held:
         return held[-1]

@@ -132,8 +132,8 @@ def _check_height(tool: Tool, parameters: KitParameters) -> None:
             f"{1e3 * parameters.minimum_wall:.1f} mm (kit.minimum_wall) would be left below it; "
             "use a higher block"
         )
-    most = tool.height - parameters.lead_in - _SHALLOWEST
-    if parameters.stand_out > max(most, 0.0) + 1e-9:
+    most = max(tool.height - parameters.lead_in - _SHALLOWEST, 0.0)
+    if parameters.stand_out > most + 1e-9:
         raise UserError(
             f"'{tool.name}' is {1e3 * tool.height:.1f} mm high and is not held if it stands out by "
             f"{1e3 * parameters.stand_out:g} mm: let it stand out by at most {1e3 * most:.1f} mm"

@@ -51,6 +51,7 @@ def test_causes_of_an_object_that_was_never_held(scene: Scene):
     beside = flat(0.3, 0.0)
     assert cause(scene, beside) == "never picked"
     assert cause(scene, beside, record(scene, "unfinished")) == "never picked"
+    assert cause(scene, beside, record(scene, "unreachable")) == "never picked"
     assert cause(scene, beside, record(scene, "missed")) == "missed grasp"
     assert cause(scene, beside, record(scene, "placed", tool=1)) == "never picked"
 
