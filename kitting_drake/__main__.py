@@ -13,7 +13,7 @@ COMMANDS = {
     "train": "train networks from demonstrations or static scenes",
     "decide": "decide one pick and place from a real camera's frames",
     "demonstrate": "convert frames and actions of a real bench to demonstrations",
-    "hkd": "manage tools and kits: list, sheet, build, import, trace, annotate, kit",
+    "hkd": "manage tools and kits: list, sheet, generate, build, import, trace, annotate, kit",
     "results": "write the pages of results from the table of runs",
     "benchmark": "measure run times, recovery, agreement with MuJoCo, the paper's tables",
 }

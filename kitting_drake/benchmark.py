@@ -114,7 +114,7 @@ def _add_kits(benchmarks: Any) -> None:
 
 def _add_fits(benchmarks: Any) -> None:
     fits = benchmarks.add_parser(
-        "fits", help="strict success and peak force against the cavities' clearance; resumes"
+        "fits", help="strict success and peak force by the cavities' clearance; run again to resume"
     )
     fits.add_argument(
         "--episodes", type=count_type, default=5, help="episodes of four tools per condition (5)"
@@ -138,14 +138,14 @@ def _add_endurance(benchmarks: Any) -> None:
     )
     add_scenario_flags(endurance)
     endurance.add_argument(
-        "--hours", type=_duration, default=8.0, help="simulated length of the shift (8)"
+        "--hours", type=_duration, default=8.0, help="simulated hours of the shift (8)"
     )
     endurance.add_argument(
         "--exchange",
         type=_duration,
         default=10.0,
         metavar="SECONDS",
-        help="time for exchanging the kit and bringing the next tools (10)",
+        help="simulated time for exchanging the kit and bringing the next tools (10)",
     )
     endurance.add_argument(
         "--seed", type=seed_type, help="seed of the first scene (default: the scenario's)"
@@ -194,16 +194,16 @@ def _add_reliability(benchmarks: Any) -> None:
 
 def _add_trace(benchmarks: Any) -> None:
     tracing = benchmarks.add_parser(
-        "trace", help="error of the outlines that `hkd trace` finds in drawn photos of tools"
+        "trace", help="error of the outlines that `hkd trace` finds in rendered photos of tools"
     )
     tracing.add_argument(
         "--tools",
         nargs="+",
         metavar="NAME",
-        help="names of the tools; three photos of each are drawn (default: 20 tools)",
+        help="names of the tools; three photos of each are rendered (default: 20 tools)",
     )
     tracing.add_argument(
-        "--no-exif", action="store_true", help="draw photos that do not state their focal length"
+        "--no-exif", action="store_true", help="leave the focal length out of the photos"
     )
     tracing.add_argument(
         "--keep", action="store_true", help="keep the photos and pictures in the folder photos"
@@ -214,7 +214,8 @@ def _add_trace(benchmarks: Any) -> None:
 def _add_traced_kits(benchmarks: Any) -> None:
     traced = benchmarks.add_parser(
         "traced_kits",
-        help="success of the oracle with true tools in cavities traced from drawn photos; resumes",
+        help="success of the oracle in kits whose cavities are traced from rendered photos of the "
+        "tools; run again to resume",
     )
     traced.add_argument("--kits", type=count_type, default=10, help="number of kits (10)")
     traced.add_argument(
@@ -375,7 +376,7 @@ def _endurance(arguments: argparse.Namespace, console: Console, folder: Path) ->
         raise UserError("--hours is 0: give a positive number")
     if note := uncommitted_note():
         console.print(f"note: {note}", highlight=False, markup=False)
-    # Report a scene that cannot be built before the shift starts.
+    # Fail before the shift starts if no scene can be built.
     build_any_chosen(chosen, range(seed, seed + 5))
     with alone_in(folder), open_workers(arguments, chosen) as (workers, sent):
         scenes = run_shift(

@@ -275,7 +275,7 @@ def _run(
 def _demonstrate(
     chosen: ChosenScenario, seed: int, log: Path | None, recording: FrameSettings | None
 ) -> tuple[Demonstration | Rejection, EpisodeFrames | None]:
-    # Enable rendering, because the station would otherwise have no cameras.
+    # Fail if this process cannot render: the station would have no cameras.
     require_rendering()
     try:
         diagram, station = build_chosen(chosen, seed=seed)

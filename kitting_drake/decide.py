@@ -219,7 +219,7 @@ def _parser() -> argparse.ArgumentParser:
         "--time",
         type=float,
         metavar="S",
-        help="for a recording: the time of the frame after the start, in s",
+        help="for a recording: the time of the frame since the start, in s",
     )
     parser.add_argument(
         "--robot",

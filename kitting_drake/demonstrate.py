@@ -71,8 +71,8 @@ def _parser() -> argparse.ArgumentParser:
         "folder",
         type=Path,
         metavar="FOLDER",
-        help="a folder with a folder for each demonstration, which has a folder with frames and "
-        "action.json for each step",
+        help="folder of the demonstrations; FOLDER/DEMONSTRATION/STEP/ holds the frame and the "
+        "action.json of a step",
     )
     parser.add_argument(
         "--camera",
@@ -100,7 +100,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--no_later_picks",
         action="store_true",
-        help="the order of the picks matters, for instance when stacking",
+        help="the order of the picks matters, as in stacking: learn each step only from its own "
+        "pick, not from later ones",
     )
     parser.add_argument(
         "--no_curvature",

@@ -125,7 +125,7 @@ class _Parts:
         return self._folder / f"batch_{batch:06d}.h5"
 
     def draw(self, count: int, workers: LocalWorkers, console: Console) -> None:
-        """Draws batches until `count` scenes exist, without a missing batch before them."""
+        """Draws batches until those before the first missing one hold `count` scenes."""
         begun = set(self._counts)
 
         def next_batch() -> int | None:

@@ -72,7 +72,7 @@ def main() -> int:
     known = chosen.scenario.policy.training_seeds(chosen.base).intersection(seeds)
     if known:
         console.print(f"note: the policy has learned from seeds {min(known)} to {max(known)}")
-    # Report an error now if the scene of no seed can be built.
+    # Fail before the episodes start if no scene can be built.
     success = build_any_chosen(chosen, seeds).scene.success
     if note := uncommitted_note():
         console.print(f"note: {note}", highlight=False, markup=False)

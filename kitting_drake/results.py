@@ -2,8 +2,8 @@
 
 The pages are docs/results.md with its figures, docs/protocol.md, and the tables in
 docs/robustness.md. `--add` adds a run of `evaluate` to the runs, and `--remove` removes one. A run
-with the name of a cell of `benchmark paper` fills this cell; its commit must have no uncommitted
-changes.
+with the name of a cell of `benchmark paper` fills this cell; it is refused if it was made with
+uncommitted changes.
 
 The folder also has `learning_rates.json` from `benchmark paper`, and a copy of `networks.json` from
 `benchmark networks`. All numbers come from this folder, except those of the paper.

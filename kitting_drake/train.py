@@ -35,7 +35,7 @@ def main() -> int:
     settings = _settings(arguments, learned, held_out)
     _check_validation(settings, held_out, arguments.validation or arguments.demos)
     if arguments.export:
-        # Report unusable data before the training starts.
+        # Fail before the training starts if the packages for the export are missing.
         from kitting_drake.policies.training.onnx_export import require_onnx
 
         require_onnx()
@@ -231,8 +231,8 @@ def _parser() -> argparse.ArgumentParser:
         "--validation",
         type=Path,
         metavar="FILE.h5",
-        help="validation data, which select the checkpoint (default: a tenth as many, after the "
-        "training data in --demos; static scenes are chosen with other tools)",
+        help="validation data, which select the checkpoint (default: the data after the training "
+        "data in --demos, up to a tenth as many; static scenes then have other tools)",
     )
     parser.add_argument(
         "--from",
@@ -273,8 +273,8 @@ def _add_settings(parser: argparse.ArgumentParser) -> None:
         "--rotations",
         type=count_type,
         metavar="N",
-        help="for the transporter: the number of rotations of the crop in a training step; half "
-        "as many of the scene are used (default: the minimum: the label's and four others)",
+        help="for the transporter: the number of rotations of the crop in a training step, twice "
+        "that of the scene (default: as few as possible: those of the label and four others)",
     )
     parser.add_argument(
         "--steps", type=count_type, default=10_000, help="number of training steps (10000)"
@@ -297,8 +297,8 @@ def _add_settings(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--rigid",
         action="store_true",
-        help="as in the paper: augment only by rigid motions, without bending (never used with "
-        "transporter) and mirroring (both are off if the task does not permit them)",
+        help="as in the paper: augment only by rigid motions, not by bending and mirroring (each "
+        "is always off if the task does not permit it; the transporter never bends)",
     )
     parser.add_argument(
         "--validate-every",

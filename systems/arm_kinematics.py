@@ -6,8 +6,8 @@ is Rot_x(alpha) Trans_x(a) Rot_z(q) Trans_z(d); source: Franka's FCI documentati
 
 Frames: B is the arm's base, F its flange, G the gripper frame of `systems.hand_geometry`. A hand
 pose is (x, y, z, yaw) of G in the world: the hand's z axis points down, its x axis along
-(cos yaw, sin yaw). The last joint's axis is then vertical, so joint 7 turns the hand about its own
-vertical axis: a yaw of +a needs a joint rotation of -a.
+(cos yaw, sin yaw). The axis of joint 7 then points down too, so a rotation of joint 7 by -a turns
+the hand by a yaw of +a.
 """
 
 from __future__ import annotations
@@ -189,12 +189,12 @@ def joint_seven(wrist: ArrayLike, yaw: ArrayLike) -> NDArray[np.float64]:
 
 
 def planar(tip: NDArray[np.float64], q7: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The joint positions at which the whole arm lies in the vertical plane of its base and the
-    hand.
+    """The joint positions at which the whole arm lies in the vertical plane through its base and
+    the hand.
 
     Joints 3 and 5 are at zero. This is one of the solutions of `inverse`. It also exists when the
-    elbow is straight above the shoulder, where `inverse` is singular. All along a straight line in
-    joint space between two such positions, the hand points down.
+    elbow is straight above the shoulder, where `inverse` is singular. The hand also points down at
+    all joint positions on the straight line between two such positions in joint space.
 
     Args:
         tip: (..., 3) the point midway between the fingertip ends, in B, in m.

@@ -31,6 +31,7 @@ _FARTHEST_STOP = 0.02
 """If a commanded stop is further than this from the hand's pose, in m, the arm brakes where it
 is."""
 _SAME_HEIGHT = 0.003
+"""A hand that is less than this below a height, in m, counts as having reached it."""
 
 _HELD_REACH = 0.125
 """How far a held object reaches from the fingertips at most, in m. `read_surface_heights` assumes
@@ -64,8 +65,8 @@ class ArmMotion(JawMotion):
       limits and the parameters' linear speed and acceleration allow. The hand rises straight up to
       the clear height, travels above it, and sinks only near its goal. Corners are rounded.
     - `DESCEND`, `LOWER`, `SEARCH`: straight lines of the hand, with the parameters' speeds.
-    - A mode that begins while the arm moves first brakes, as fast as the limits of acceleration and
-      jerk allow. The exception is `CARRY` after `LIFT`: these two are one motion.
+    - If a mode begins while the arm moves, the arm first brakes, as fast as the limits of
+      acceleration and jerk allow. The exception is `CARRY` after `LIFT`: these two are one motion.
 
     Position, velocity, acceleration and jerk of all joints are within their limits at all times.
 

@@ -40,7 +40,7 @@ _PLANAR = 1e-6
 
 @dataclass(frozen=True)
 class HandStop:
-    """A place where the hand goes down and up again, in the world."""
+    """A place where the hand goes down and up again: x and y in the world in m, and yaw in rad."""
 
     name: str
     x: float
@@ -125,7 +125,7 @@ class ArmPostures:
 
         Args:
             stops: the stops, in the order in which the hand visits them.
-            now: (7) present joint positions.
+            now: (7) present joint positions, in rad.
 
         Returns:
             (7) joint positions for each stop, and a sentence that says why the arm cannot reach the

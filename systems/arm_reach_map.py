@@ -20,6 +20,7 @@ hand, as in `systems.arm_postures`."""
 _STEP = 0.005
 """Distance between the radii whose postures are computed, in m."""
 _FARTHEST = 1.0
+"""Largest radius whose postures are computed, in m."""
 _CHUNK = 256
 
 

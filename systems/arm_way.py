@@ -27,6 +27,7 @@ _ROUNDING, _WIDER = 0.15, 0.3
 """Each corner of a path is rounded over this length, given as a time in s like `_SPACING`. `_WIDER`
 holds for paths with only one corner."""
 _FEWEST, _MOST = 40, 200
+"""Least and largest number of points of a path."""
 _TRIES, _PATIENCE = 8, 3
 """A path that crosses too low is raised at most `_TRIES` times; after `_PATIENCE` tries, by more
 each time."""

@@ -47,7 +47,7 @@ class ClutterExpert:
         Args:
             table: the objects and their grasps.
             poses: X_WB of each object.
-            failed: gripper poses, in the world, of earlier picks that held nothing.
+            failed: gripper poses of earlier failed picks, in the world.
         """
         self._table, self._poses, self._failed = table, list(poses), failed
         self._points = table.points(poses)

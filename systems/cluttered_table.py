@@ -141,7 +141,7 @@ class ClutteredTable:
 
         It must lie flat and the right way up, or have rolled without a visible change, as a round
         handle does. The heading of an object that has rolled is the one at which the flat object
-        would look most alike.
+        would look most similar.
         """
         yaw = heading(X_WB)
         if tilt(X_WB) < _FLAT:
@@ -175,7 +175,7 @@ class ClutteredTable:
             index: index of the object.
             poses: X_WB of each object.
             points: the surface points of each object in the world.
-            failed: gripper poses, in the world, of earlier picks that held nothing.
+            failed: gripper poses of earlier failed picks, in the world.
             ignores_fixtures: whether fixtures do not count as obstructions. Set it for an object
                 that lies in a cavity.
             steepest: grasps on faces that are tilted by more than this, in radians, from the

@@ -19,9 +19,9 @@ class MotionHeights:
     travel: float
     """Lowest height at which the held object clears everything."""
     pick_hover: float
-    """Height above the pick down to which the hand moves fast."""
+    """Height down to which the hand moves fast towards the pick."""
     place_hover: float
-    """Height above the place down to which the hand moves fast with the held object."""
+    """Height down to which the hand moves fast towards the place, with the held object."""
 
 
 def motion_heights(heights: SurfaceHeights, parameters: PickPlaceParameters) -> MotionHeights:

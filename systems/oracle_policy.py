@@ -82,8 +82,8 @@ class OraclePolicy(LeafSystem):
         name: OraclePolicy
         input_ports:
         - body_poses
-        - kept_goals
-        - failed_picks
+        - kept_goals (optional)
+        - failed_picks (optional)
         - mode (optional)
         - accepted_action (optional)
         output_ports:
@@ -93,7 +93,7 @@ class OraclePolicy(LeafSystem):
     - `kept_goals` (one element for each goal): the `PlacementMonitor`'s port of that name, which
       marks goals that count as filled for good. If it is not connected, no goal is kept.
     - `failed_picks` (abstract, a tuple of `PlanarPose`): the planner's port of that name. It is
-      optional, and used only if objects may lie on each other.
+      used only if objects may lie on each other.
     - `mode` (1) and `accepted_action` (abstract, `PickPlaceAction`): the planner's ports of those
       names, from which the oracle counts its attempts (see `AttemptMemory`).
     - `action` (abstract, `PickPlaceAction`): moves an object to a goal; `stop` when every goal is
@@ -108,7 +108,7 @@ class OraclePolicy(LeafSystem):
        lies on it. Of equally high ones, the one that `evaluate_placements` assigned.
     3. The goal pose: of the goal's unoccupied poses, the one that rotates the object least.
     4. The grasp: of those that keep the fingers clear of other objects at the pick and the place,
-       the one that was tried least often. So after a slip the next grasp follows.
+       the one that was tried least often. So after a slip the oracle tries another grasp.
 
     With a quantizer, the action is the best that a policy of the paper can choose. The pick is the
     rounded annotated grasp. The place is the gripper pose that brings the object, held by the

@@ -78,9 +78,9 @@ class PickPlacePlanner(LeafSystem):
     - `mode` (1): a `Mode`.
     - `counts` (4): the numbers of actions begun, grasps missed, objects dropped, and actions
       stopped by the force guard.
-    - `failed_picks` (abstract, a tuple of `PlanarPose`): the last 16 picks whose action did not
-      place an object, oldest first: the grasp was missed or lost, the object was pressed down, or
-      the action was stopped. A policy can use them to try another pick.
+    - `failed_picks` (abstract, a tuple of `PlanarPose`): the last 16 picks whose action had another
+      outcome than "placed" (see `OUTCOMES`), oldest first. A policy can use them to try another
+      pick.
     - `history` (abstract, a tuple of `Attempt`): the last 64 actions with a known outcome, oldest
       first.
     - `peak_force` (3): the largest vertical and lateral contact force on the hand in the present or

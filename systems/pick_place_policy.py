@@ -24,7 +24,7 @@ class PolicyFunction(Protocol):
 
         Args:
             observation: o_t, and the `history` of the episode.
-            failed_picks: poses of failed grasps in the world, latest last.
+            failed_picks: poses in the world of the picks whose actions failed, oldest first.
         """
         ...
 
@@ -48,8 +48,8 @@ class PickPlacePolicy(LeafSystem):
 
     - `observation` (abstract, `Observation`): o_t. If the policy uses only heights, the port is
       called `observation_heights` instead, and the colours may be missing.
-    - `failed_picks` (abstract, a tuple of `PlanarPose`): poses of failed grasps; empty if not
-      connected.
+    - `failed_picks` (abstract, a tuple of `PlanarPose`): the planner's port of that name; empty if
+      not connected.
     - `history` (abstract, a tuple of `Attempt`): the earlier actions, passed to the policy as
       `observation.history`. If not connected, the observation's own history stays.
     - `action` (abstract, `PickPlaceAction`): the policy's action.

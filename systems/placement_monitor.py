@@ -36,7 +36,7 @@ class PlacementMonitor(LeafSystem):
         name: PlacementMonitor
         input_ports:
         - body_poses
-        - mode
+        - mode (optional)
         output_ports:
         - placements
         - reward

@@ -13,7 +13,11 @@ RECENT = 16
 
 
 class PlannerState(VectorView):
-    """The planner's state vector, in SI units."""
+    """The planner's state vector, in SI units.
+
+    Fields with the ending `_z` are heights in the world. Those without a docstring come from
+    `MotionHeights` and `SurfaceHeights`.
+    """
 
     mode = Number()
     start_time = Number()
@@ -46,6 +50,7 @@ class PlannerState(VectorView):
     table_z = Number()
     support_z = Number()
     rim_z = Number()
+    """Least possible height of the rim around the place."""
     floor_z = Number()
     doubt = Number()
     """The uncertainty of the surface heights."""
@@ -81,6 +86,8 @@ class PlannerState(VectorView):
     missed = Number()
     dropped = Number()
     stopped = Number()
+    """Number of actions that the force guard stopped. `actions`, `missed` and `dropped` are the
+    numbers of actions begun, grasps missed and objects dropped."""
     stops = Number()
     """1 if the force guard has ended the action, else 0."""
     refused = Number()

@@ -247,7 +247,7 @@ STOP_REASONS = {
     "no kit seen": "no kit is seen",
     "not seen": "too little is seen of where the robot would have to pick or place",
     "not sure": "no pick and place is likely enough to succeed",
-    "gave up": "what is left could not be done",
+    "gave up": "the remaining objects could not be placed",
     "actions spent": "no actions are left",
 }
 """Reasons why no more actions follow, each with a sentence for people."""

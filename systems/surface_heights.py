@@ -53,7 +53,7 @@ def read_surface_heights(
 
     - Unseen pixels are filled in (`fill_unseen`).
     - An object's support is a low percentile of the heights around it. An object in the middle of
-      others is thus assumed to stand on the same surface.
+      others is thus assumed to stand on the same surface as the others.
     - Tops are maxima over a few pixels. The floor of a place is the minimum over the seen pixels.
       If o_t is noisy, medians and percentiles are used instead, corrected for their bias.
     - The table is assumed to be level and at the bottom of the grid. If it looks tilted or shifted

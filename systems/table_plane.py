@@ -12,12 +12,14 @@ _LEAST = 200
 _LEAST_SHARE = 0.15
 """Least share of the seen pixels that must lie on the table."""
 _BIN = 0.001
+"""Width of the bins of the histogram of heights, in metres."""
 _FAR = 0.03
 """The table is sought within this distance of the bottom of the grid, in metres."""
 _BAND = 0.004
 """A pixel belongs to a plane if it is within this distance, in metres, or within three times the
 noise if that is more."""
 _FITS = 8
+"""Number of fits of the plane, each to more pixels or to nearer ones."""
 _LEVEL = 0.0003
 """A table whose deviations are smaller than this, in metres, counts as level."""
 _MOST_OFF, _STEEPEST = 0.010, 0.035

@@ -38,9 +38,9 @@ _X_HANDG = RigidTransform(RollPitchYaw(math.pi, 0, 0), [0, 0, FINGERTIP_DISTANCE
 _FLOOR = -0.75
 """World z of the floor below the table, in m."""
 _PEDESTAL = (0.26, 0.22)
-"""Extents of an arm's pedestal along its x and y, in m; its foot is 0.23 x 0.19 m."""
+"""Extents of an arm's pedestal along the base's x and y, in m; the arm's foot is 0.23 x 0.19 m."""
 _PEDESTAL_MIDDLE = -0.04
-"""Position of the middle of the foot along the base's x axis, in m."""
+"""Position of the middle of the arm's foot along the base's x axis, in m."""
 
 
 def joint_names(robot: Robot) -> tuple[str, ...]:

@@ -22,8 +22,8 @@ def check_scene_reach(scene: Scene, motion: RobotMotion, parameters: PickPlacePa
     """Raises an error if an arm reaches no object or no goal of a scene. A floating hand reaches
     all.
 
-    If only some objects or goals are out of reach, there is no error here. Actions on them are
-    refused during the episode.
+    It is no error if some objects or goals are out of reach: actions on them are refused during the
+    episode.
 
     Raises:
         UserError: all objects that can fill a goal are out of reach, or all goals.

@@ -356,7 +356,7 @@ class KittingStation(Diagram):
 
         A frozen object's joint is locked. Its contact with table, fixtures and other frozen objects
         is filtered out, but bodies that are not frozen still collide with it. If sleep is disabled,
-        only objects that have not appeared are frozen.
+        only objects outside the cell are frozen, and only in tasks where objects appear.
         """
         may_sleep = self.at_rest(root_context)
         if not self.scenario.sleep.enabled:

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from pydrake.visualization import VideoWriter
 
 MESHCAT_PERIOD = 1 / 32
+"""Simulated time between two pictures in Meshcat, in s."""
 _FIELD_OF_VIEW_DEG = 34.0
 """Vertical field of view with which Meshcat starts."""
 
