@@ -147,7 +147,7 @@ def evaluate(
     clock = _WallClock(folder / "wall_seconds.json")
     earlier = read_lines(path)
     if not all(isinstance(item, dict) and {"seed", "objects"} <= item.keys() for item in earlier):
-        raise UserError(f"{path} is damaged: a line is not an episode")
+        raise UserError(f"{path} is damaged: delete the line that is not an episode")
     done = {episode["seed"]: episode for episode in earlier}
     pending = [seed for seed in seeds if seed not in done]
     queue = iter(pending)

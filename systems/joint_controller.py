@@ -85,7 +85,9 @@ class JointController(LeafSystem):
         """
         super().__init__()
         if arm.num_positions() != JOINTS + FINGERS:
-            raise ValueError(f"arm must have 9 positions, not {arm.num_positions()}")
+            raise ValueError(
+                f"arm must have 9 positions (7 joints and 2 fingers), not {arm.num_positions()}"
+            )
         self._arm, self._step, self._fingers = arm, step, fingers
         # Scratch memory: each call overwrites the values before it reads them.
         self._scratch, self._forces = arm.CreateDefaultContext(), MultibodyForces(arm)
