@@ -80,8 +80,8 @@ class ArmTrajectory:
         return (len(self.positions) - 1) / self.rate
 
     def at(self, time: float) -> NDArray[np.float64]:
-        """(21) joint positions, velocities and accelerations at a time since the start, in s. The
-        arm is at rest before the start and after the end.
+        """(21) joint positions, velocities and accelerations, in rad and s. The time, in s, is
+        counted from the start. The arm is at rest before the start and after the end.
 
         Between the points, positions follow polynomials of degree 5 that fit position, velocity and
         acceleration at both ends, as in ROS's `joint_trajectory_controller`.
@@ -222,7 +222,8 @@ def limits_used(
     """The largest share of each limit that a motion uses.
 
     Args:
-        samples: (n, 21) positions, velocities and accelerations at a constant rate.
+        samples: (n, 21) joint positions, velocities and accelerations at a constant rate, in rad
+            and s.
         limits: limits of the joints; those of the velocities may depend on the positions.
         rate: rate of the samples, in Hz. At rates below 1 kHz the jerk is underestimated.
     """

@@ -117,8 +117,8 @@ class ArmWay:
         self._accelerations = self._hand_accelerations()
 
     def at(self, time: float) -> NDArray[np.float64]:
-        """(21) joint positions, velocities and accelerations at a time since the beginning, in
-        s."""
+        """(21) joint positions, velocities and accelerations, in rad and s. The time, in s, is
+        counted from the beginning of the motion."""
         if time >= self.duration - _INSTANT:
             goal = self._motion.goal if self._motion else self._rest
             return np.concatenate([goal, np.zeros(2 * JOINTS)])
@@ -128,7 +128,7 @@ class ArmWay:
         return self._motion.at(time - self._stopping)
 
     def positions(self) -> NDArray[np.float64]:
-        """(n, 7) joint positions along the motion."""
+        """(n, 7) joint positions along the motion, in rad."""
         if self._motion is None:
             return self._rest[None]
         return self._motion.samples[::_COARSE, :JOINTS]

@@ -289,8 +289,8 @@ def _deviation(item: PlacedObject, points: Points, yaw: float) -> float:
 
 
 def middle(points: Points, yaw: float) -> NDArray[np.float64]:
-    """(2,) x and y of the middle of the box around points (m, 3) that has a side in the direction
-    `yaw`."""
+    """(2,) x and y of the middle of the box around points (m, 3), in metres. One side of the box
+    has the direction `yaw`, in radians."""
     cos, sin = math.cos(yaw), math.sin(yaw)
     along, across = points[:, :2] @ [cos, sin], points[:, :2] @ [-sin, cos]
     u, v = (along.min() + along.max()) / 2, (across.min() + across.max()) / 2

@@ -208,8 +208,8 @@ class HandMotion(JawMotion):
         self.set_times(state)
 
     def motion_at(self, state: PlannerState, time: float) -> NDArray[np.float64]:
-        """(12) the hand's desired position, velocity and acceleration, each as x, y, z, yaw, in the
-        present mode."""
+        """(12) the hand's desired position, velocity and acceleration in the present mode, each as
+        x, y, z, yaw, in m, rad and s."""
         if time >= state.start_time + state.duration:
             return np.concatenate([state.goal, np.zeros(8)])
         return motion_at(

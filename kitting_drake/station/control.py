@@ -60,7 +60,8 @@ def add_control(
     *,
     takes_joint_targets: bool = False,
 ) -> PickPlacePlanner:
-    """Adds planner and controller, connects them to the plant, and exports their ports.
+    """Adds planner and controller, connects them to the plant, and exports their ports. Returns the
+    planner.
 
     Args:
         builder: the builder of the station.
@@ -112,7 +113,7 @@ def add_control(
 
 
 def _drive_hand(builder: DiagramBuilder, scenario: Scenario, plant: MultibodyPlant) -> _Driven:
-    """Adds the controller of the floating hand."""
+    """Adds the controller of the floating hand; returns the ports of hand and controller."""
     hand = plant.GetModelInstanceByName(HAND)
     state = plant.get_state_output_port(hand)
     controller = builder.AddNamedSystem("controller", _hand_controller(scenario, plant))
@@ -138,7 +139,8 @@ def _drive_hand(builder: DiagramBuilder, scenario: Scenario, plant: MultibodyPla
 def drive_arm(
     builder: DiagramBuilder, scenario: Scenario, robot: FrankaArm, plant: MultibodyPlant, seed: int
 ) -> _Driven:
-    """Adds the controller of an arm, and the estimate of the force on its hand."""
+    """Adds the controller of an arm, and the estimate of the force on its hand. Returns their
+    ports."""
     arm, hand = (plant.GetModelInstanceByName(name) for name in (ARM, HAND))
     model, gripper = arm_model(robot)
     controller = builder.AddNamedSystem(
