@@ -27,7 +27,7 @@ _REGION_FACTS = (
     *("is_object", "object_seen", "depth", "hole", "size", "apart"),
     *("over_recess", "cost", "reverse", "spread", "rival", "offset", "too_high", "recess_seen"),
 )
-"""The facts that need an object under the pick, or a recess under the place; otherwise zero."""
+"""The facts that are zero without an object under the pick or a recess under the place."""
 _FAR = 20.0
 """Upper limit of the distance from other objects, in mm."""
 _WORST_FIT = 0.002
@@ -52,6 +52,9 @@ def geometric_evidence(
         fit_cost: the mean difference of the outlines of object and recess, in metres; None if they
             do not fit.
         grasp_cost: the cost of the grasp, see `JawGrasp.cost`; None if there is no feasible grasp.
+
+    Returns:
+        The facts by name. Lengths are in mm, shares are from 0 to 1.
     """
     seen, relief = segmentation.visibility.seen, segmentation.relief
     fits, grasped = fit_cost is not None, grasp_cost is not None

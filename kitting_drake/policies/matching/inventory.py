@@ -182,8 +182,8 @@ class Inventory:
 
     @property
     def _has_filled(self) -> bool:
-        """Whether an earlier action placed an object into a fixture that now looks like a plain
-        block."""
+        """Whether an earlier action placed an object onto the fixture that o_t shows. If so, a
+        fixture without visible recesses is a filled kit."""
         grid, fixture = self.observation.grid, self.segmentation.fixture
         for attempt in self._history:
             place = attempt.action.place

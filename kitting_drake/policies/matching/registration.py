@@ -3,8 +3,8 @@
 Each outline is stored as signed distances on a grid that is finer than that of o_t. A recess has
 the outline of its object, but without narrow notches, and wider by a clearance (see
 `kitting_drake.hkd.kits.layout`). So narrow notches of the object's outline are closed first. The
-outlines then differ by a constant offset, which is fitted as well. It is the clearance plus about
-half a pixel, because a view from above makes objects wider and recesses narrower.
+outlines then differ by a constant offset, which is fitted as well. It is about one pixel minus the
+clearance, because a view from above makes objects wider and recesses narrower.
 
 At points near the object's outline, the signed distances from the two outlines are compared. The
 cost is the mean of a robust function of their differences. Gauss-Newton minimizes it over
@@ -28,14 +28,14 @@ Array = NDArray[np.float64]
 _SUBSAMPLING = 3
 """Number of fine pixels per pixel of o_t, along each axis."""
 _CLOSING_RADIUS = 0.008
-"""Half the width, in metres, below which a notch of an object is missing in its recess."""
+"""A recess lacks those notches of its object that are narrower than twice this, in metres."""
 _BAND = 0.006
 """The cost is computed at points within this distance, in metres, of the object's outline."""
 _FARTHEST = 0.012
 """Signed distances are clipped to plus or minus this many metres."""
 _ROBUST = 0.002
-"""In the cost, residuals larger than this, in metres, count as this much. Larger ones come from
-hidden or touching parts."""
+"""In the cost, residuals are capped at this many metres. Larger ones come from hidden or touching
+parts."""
 _WORST_REVERSE = 0.0025
 """The largest mean distance, in metres, of a recess's outline from the outline of an object that
 fills the recess."""
@@ -94,7 +94,7 @@ class Registration:
     """The mean robust difference of the outlines, in metres."""
     offset: float = 0.0
     """The signed distance of a point from the recess's outline minus that from the object's, in
-    metres."""
+    metres; negative if the recess is larger."""
 
     def moved(self, pixel: Array) -> Array:
         """Returns the new position of a point (row, col) of the object."""
@@ -165,7 +165,7 @@ def register(
             many rotations about the centroids are refined.
         within: whether `recess` is in fact the outline of several touching objects, and `outline`
             that of one of them. Parts of `outline` then have no counterpart and get little weight,
-            and the offset is nearly zero.
+            and the offset is at most `_OFFSET_WITHIN`.
     """
     begins = starts or _coarse_starts(outline, recess)
     found = [_refine(outline, recess, rotation, shift, within) for rotation, shift in begins]
@@ -233,13 +233,14 @@ class FitQuality:
     reverse: float
     """The mean distance of the recess's points from the object's outline, in metres."""
     spread: float
-    """The standard deviation of the position of the object's points, in pixels, if the distances at
-    the points were independent."""
+    """The standard deviation, in pixels, of the fitted positions of the object's points. It is
+    computed as if the errors of the distances were independent."""
     rival: float
     """The least coarse cost of a clearly different rotation, minus that of this rotation, in
     metres. It is small for objects with rotational symmetry."""
     offset: float
-    """How much larger the recess is than the object on every side, in metres."""
+    """How much smaller the recess is than the object on every side, in metres; negative if the
+    recess is larger."""
 
 
 def fit_quality(outline: Outline, recess: Outline, fit: Registration) -> FitQuality:

@@ -53,7 +53,7 @@ def separating_action(
         failed_picks: gripper poses at which a grasp failed before; they are avoided.
 
     Returns:
-        The action for the first of the inventory's `strangers` that can be gripped; None if there
+        The action for the highest of `Inventory.worth_a_try` that can be gripped; None if there
         is none, or no room on the table.
     """
     observation, segmentation = inventory.observation, inventory.segmentation
@@ -162,7 +162,8 @@ def _layers(segmentation: Segmentation, region: Region) -> list[Region]:
 def _free_pose(
     segmentation: Segmentation, region: Region, layer: Region, pick: Array, resolution: float
 ) -> tuple[Array, float] | None:
-    """Finds the nearest of the free poses with the most room for an object.
+    """Finds the nearest pose on the table at which an object has as much room as possible
+    (`_ROOMS`).
 
     Returns:
         The place (row, col) of the gripped point and the object's rotation in radians; None if

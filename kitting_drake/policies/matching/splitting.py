@@ -64,9 +64,10 @@ _ACROSS = 6
 """Something lies across an object's outline if at least this many of its pixels are inside the
 outline, and as many outside."""
 _SLIVER = 1
-"""The rest of a region is thinned by this many pixels, to drop slivers."""
+"""What remains of a region after objects are cut out is eroded by this many pixels, to drop
+slivers."""
 _LEAST_REST = 0.0002
-"""The rest of a region is an object if its area is at least this, in square metres."""
+"""What remains of a region is an object if its area is at least this, in square metres."""
 
 
 @dataclass(frozen=True)
@@ -151,7 +152,8 @@ def _split(
 
 
 def _rest(rest: Mask, relief: NDArray[np.float32], resolution: float) -> list[Region]:
-    """Returns the objects in the rest of a region, without slivers."""
+    """Returns the objects in `rest`, which remains of a region after objects are cut out. Slivers
+    are dropped."""
     core = ndimage.binary_erosion(rest, iterations=_SLIVER)
     labels, count = ndimage.label(ndimage.binary_propagation(core, mask=rest))
     regions = (labels == number for number in range(1, count + 1))

@@ -106,6 +106,7 @@ def _mode(values: NDArray[np.float32]) -> float:
 
 
 def fit_table(height: NDArray[np.float32]) -> Plane:
+    """Fits the plane of the table to heights (rows, cols), in metres."""
     low = height[height <= np.median(height)]
     return _fit_plane(height, _mode(low), np.ones(height.shape, bool))
 

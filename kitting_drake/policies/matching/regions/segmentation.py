@@ -97,8 +97,8 @@ class Segmentation:
     relief: NDArray[np.float32]
     """(rows, cols): height above the table plane in metres; unseen pixels are filled in."""
     depth: NDArray[np.float32]
-    """(rows, cols): depth below the plane of the fixture's top in metres; zero outside the
-    fixture."""
+    """(rows, cols): depth below the plane of the fixture's top in metres; zero outside the fixture
+    and within 3 mm of its outline."""
     visibility: Visibility
     """The pixels of the observation that are seen."""
     noise: float = 0.0
@@ -167,8 +167,8 @@ class Segmentation:
         """Whether a region is only a fragment of a filled recess.
 
         The larger part of the filled recess then shows the object's top, slightly below the
-        fixture's top. In a free recess, only those slots look so shallow whose floor no camera
-        sees, and the slots are the smaller part.
+        fixture's top. In a free recess, only narrow slots whose floor no camera sees look so
+        shallow, and they are the smaller part.
         """
         if self.noise > CLEAN:
             return False

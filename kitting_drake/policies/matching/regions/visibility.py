@@ -133,7 +133,7 @@ class Visibility:
 
 
 def _at(mask: Mask, positions: Array) -> Mask:
-    """Returns the values of a mask at positions (..., 2) in pixels; True outside the mask."""
+    """Returns the values of a mask at positions (..., 2) in pixels; True outside the image."""
     row, col = np.moveaxis(np.rint(positions).astype(int), -1, 0)
     rows, cols = mask.shape
     outside = (row < 0) | (row >= rows) | (col < 0) | (col >= cols)
