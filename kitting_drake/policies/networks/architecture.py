@@ -61,7 +61,7 @@ _SMALL = Preset(
 PRESETS = {
     # The sizes in section V-A of the paper.
     "paper": Preset(),
-    # For machines without an accelerator: each U-net has 0.2 M parameters.
+    # For machines without an accelerator: each U-net has 0.16 M parameters.
     "small": _SMALL,
     # As "small", but the baselines are reduced by the same factor as the SO(2) networks. The
     # Transporter has 1/25 of the original's parameters. At N = 36 the Equivariant Transporter's
@@ -108,7 +108,7 @@ class NetworkConfig:
     preset: str = "small"
     """The name of the networks' size, one of PRESETS."""
     orientations: int = 180
-    """N, the number of orientations, at which the networks are trained."""
+    """N, the number of orientations in a full turn, at which the networks are trained."""
     colour_mean: float = 0.5
     """The mean colour in training; inputs are normalised by it."""
     colour_std: float = 0.25

@@ -99,7 +99,7 @@ class Networks(nn.Module):
         """The floating-point type of the networks' inputs, in which they compute."""
         self.rotations: int | None = None
         """The number of crop rotations in a training step of the Transporter. Scene rotations are
-        half as many. None is the default of `transporter.draw_bins`. Other methods ignore it."""
+        half as many. None uses the default of `transporter.draw_bins`. Other methods ignore it."""
         self.stop_threshold: float | None = None
         """The log-odds below which a policy stops; None if it never stops. `validation.validate`
         chooses it, and it is stored with the weights."""
@@ -179,7 +179,7 @@ class Networks(nn.Module):
         Args:
             image: the observation.
             pixel: (row, col) of the pick.
-            orientations: N, the number of orientations.
+            orientations: N, the number of orientations in a full turn.
         """
         rows, cols = image.shape[1:]
         scene, encoding = self.encode_scene(image), self.encode_crop(image, pixel)
@@ -193,8 +193,7 @@ class Networks(nn.Module):
     def losses(
         self, sample: LabelledImage, random: np.random.Generator
     ) -> Iterator[tuple[str, Callable[[], Tensor]]]:
-        """Yields the name of each module and a function that computes the module's loss on a
-        sample."""
+        """Yields the name of each loss and a function that computes this loss on a sample."""
         sample = within_image(sample)
         pixels = [jittered(pick, random) for pick in (sample.pick, *sample.other_picks)]
         seed = int(random.integers(2**62))

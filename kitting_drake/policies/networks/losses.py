@@ -116,7 +116,7 @@ def angle_loss(logits: Tensor, theta: float, orientations: int) -> Tensor:
     Args:
         logits: (N / 2,) logits of the angles 2 pi i / N.
         theta: the angle of the label, in radians.
-        orientations: N, the number of orientations.
+        orientations: N, the number of orientations in a full turn.
     """
     bins = theta / (math.tau / orientations)
     label = soft_label(interpolate_label(bins, orientations // 2, cyclic=True), like=logits)
@@ -143,7 +143,7 @@ def place_loss(
         encoding: (1, channels, side, side), psi(c).
         pixel: the label (row, col).
         rotation: the rotation of the label, in radians.
-        orientations: N, the number of orientations.
+        orientations: N, the number of orientations in a full turn.
         generator: draws how far the window and the coarse rotations are offset from the label.
     """
     draws = torch.rand(3, generator=generator).tolist()

@@ -55,7 +55,7 @@ the task align-box-corner, with a learning rate of 3e-4, the validation cross-en
 rotations was 6.6 with 2 draws and 7.9 with 16.
 """
 _COARSE = 36
-"""The largest number of crop rotations that are encoded first at inference."""
+"""The largest number of crop rotations in the coarse search at inference."""
 _CANDIDATES = 3
 """The number of coarse peaks that are refined at inference."""
 
@@ -220,7 +220,7 @@ class TransporterNetworks(Networks):
 
 
 def coarse_bins(orientations: int) -> list[int]:
-    """Returns the crop rotations that are encoded first at inference, in bins; at most 36."""
+    """Returns the crop rotations of the coarse search at inference, in bins; at most 36."""
     count = min(orientations, _COARSE)
     return [round(i * orientations / count) for i in range(count)]
 

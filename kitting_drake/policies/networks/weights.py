@@ -260,9 +260,11 @@ def _json(path: Path, metadata: dict[str, str], key: str) -> dict[str, Any]:
     try:
         value = json.loads(metadata[key])
     except (KeyError, ValueError) as error:
-        raise UserError(f"{path}: its {key} is missing or not valid JSON") from error
+        raise UserError(
+            f"{path}: its {key} is missing or not valid JSON: give a file that `train` wrote"
+        ) from error
     if not isinstance(value, dict):
-        raise UserError(f"{path}: its {key} must be a JSON object")
+        raise UserError(f"{path}: its {key} must be a JSON object: give a file that `train` wrote")
     return value
 
 

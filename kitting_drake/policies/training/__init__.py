@@ -1,1 +1,1 @@
-"""Training: losses, steps, runs that resume, validation, export."""
+"""Training: steps, runs that resume, validation, export to ONNX."""

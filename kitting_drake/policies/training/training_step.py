@@ -19,8 +19,8 @@ from kitting_drake.policies.networks.factored import Networks
 BETAS = (0.9, 0.999)
 
 _STOP_PROBABILITY = 1 / 8
-"""The probability that a sample of networks with a stop class is accompanied by a final
-observation."""
+"""For networks with a stop class, the probability that a sample comes with a final observation, in
+which nothing is left to pick."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class _Draw:
     random: np.random.Generator
     """The generator for the random draws of the losses."""
     final: Image | None
-    """A final observation, from which the networks learn to stop; None in most steps."""
+    """A final observation, from which the networks learn to stop; None for most samples."""
     stop_random: np.random.Generator
     """The generator for the random draws of the stop loss."""
 
@@ -211,7 +211,7 @@ class Trainer:
         return _Draw(sample, random, self._draw_final(finals, stop_random), stop_random)
 
     def _draw_final(self, finals: Sequence[Pictured], random: np.random.Generator) -> Image | None:
-        """Returns a randomly moved final observation; in most steps None."""
+        """Returns a randomly moved final observation; None for most samples."""
         if not (self.networks.config.stop and finals) or random.random() >= _STOP_PROBABILITY:
             return None
         return Motion.draw(finals[int(random.integers(len(finals)))].image, random).moved_image()

@@ -54,7 +54,7 @@ def lift(encoding: Tensor, angles: Tensor, size: int) -> Tensor:
 
 
 def cross_correlation(scene: Tensor, kernels: Tensor) -> Tensor:
-    """Computes the cross-correlation of equation 8 directly.
+    """Computes the cross-correlation of equation 8 directly, divided by `KERNEL`.
 
     Args:
         scene: (1, channels, rows, cols), phi(o_t).
@@ -259,7 +259,7 @@ def ranked(candidates: Iterable[Candidate], orientations: int) -> list[Candidate
 
     Args:
         candidates: windows around the peaks of the coarse volume.
-        orientations: N, the number of orientations.
+        orientations: N, the number of orientations in a full turn.
     """
     of_cell: dict[tuple[int, int, int], Candidate] = {}
     for candidate in candidates:
@@ -297,13 +297,13 @@ def peaks(volume: Tensor, count: int) -> Iterator[tuple[int, int, int]]:
 
 
 def finer_bins(rotation: int, coarse: int, orientations: int) -> tuple[int, int]:
-    """Returns the first and the last of the N bins between the coarse rotations before and after a
-    given coarse rotation.
+    """Returns the first and the last of the N bins that cover the range from the previous to the
+    next coarse rotation.
 
     Args:
-        rotation: the given rotation, in coarse bins.
+        rotation: the coarse rotation in the middle of the range, in coarse bins.
         coarse: the number of coarse bins over a full rotation.
-        orientations: N, the number of orientations.
+        orientations: N, the number of orientations in a full turn.
     """
     first = math.floor((rotation - 1) * orientations / coarse)
     return first, math.ceil((rotation + 1) * orientations / coarse)
@@ -337,7 +337,7 @@ def search(
     Args:
         scene: (1, channels, rows, cols), odd sides, phi(o_t).
         encoding: (1, channels, side, side), psi(c).
-        orientations: N, the number of orientations.
+        orientations: N, the number of orientations in a full turn.
         shape: how many rows and cols of the scene to search; all by default.
         candidates: the number of coarse peaks to refine.
 

@@ -118,7 +118,10 @@ class Regular:
 
     def __post_init__(self) -> None:
         if self.order < 1 or self.quotient < 1 or self.order % self.quotient:
-            raise ValueError(f"C_{self.order} has no subgroup of {self.quotient} elements")
+            raise ValueError(
+                f"C_{self.order} has no subgroup of {self.quotient} elements: the quotient must "
+                "divide the order"
+            )
 
     @property
     def size(self) -> int:
