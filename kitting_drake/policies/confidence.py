@@ -29,13 +29,13 @@ if TYPE_CHECKING:
 FILE = MODELS / "policies" / "confidence.json"
 """The file of the fitted regressions, one for each kind of policy."""
 _SAME_PICK = 0.010
-"""The radius, in metres, around the pick within which predicted probability supports the pick."""
+"""Predicted probability within this distance of the pick, in metres, supports the pick."""
 _OTHER_PICKS = 0.060
-"""The radius, in metres, around the pick within which predicted probability is taken to belong to
-the same object."""
+"""Predicted probability within this distance of the pick, in metres, is taken to belong to the same
+object."""
 _SAME_ANGLE = math.radians(10)
-"""The largest angle, in radians, from the chosen pick angle at which predicted probability supports
-the chosen angle."""
+"""Predicted probability within this angle of the chosen pick angle, in radians, supports that
+angle."""
 
 
 @dataclass(frozen=True)

@@ -72,7 +72,7 @@ class Look:
         """
         Args:
             networks: networks that are prepared for inference.
-            orientations: N, the number of orientations.
+            orientations: N, the number of orientations in a full turn.
             observation: the heightmap o_t.
             failed_picks: gripper poses at which a grasp failed before.
             resolution: the side of a pixel in training, in metres; None if unknown.
@@ -156,13 +156,13 @@ class Draft:
     """(row, col) of the place at which the outlines of object and recess fit; None if they do not
     fit."""
     belongs: bool = False
-    """Whether the outlines show that the object belongs at this place."""
+    """Whether the outlines show that the object fits into the recess at its place."""
     stop: bool = False
     """Whether the policy stops: nothing is left to pick, or nothing is seen well enough."""
     reason: str = ""
     """Why the policy stops; see `PickPlaceAction.reason`."""
     mending: PickPlaceAction | None = None
-    """An action that corrects an earlier failure and replaces this draft; None if there is none."""
+    """An action of the stage `Recovery`, which replaces this draft; None if there is none."""
 
     @property
     def place(self) -> Array:

@@ -81,11 +81,11 @@ def load_learned_policy(
         weights: a file that `train` wrote; None for the weights that come with the package.
         planner: parameters of the motion with which the hand will pick and place.
         insertion: whether objects are inserted into recesses.
-        orientations: N, the number of orientations.
+        orientations: N, the number of orientations in a full turn.
         orientations_field: the caller's name for `orientations`, used in error messages.
         continuous: whether to refine actions beyond the networks' pixels and bins.
         fit_outlines: whether to refine actions by the geometry of o_t as well.
-        recover: whether to correct failed insertions.
+        recover: whether to correct failed insertions, take heaps apart and turn objects over.
         may_stop: whether the policy may stop when there is nothing left to pick.
         watch: if given, a function that is called with each observation and decision.
 
@@ -129,7 +129,7 @@ def make_shape_matching(
 
     Args:
         planner: parameters of the motion with which the hand will pick and place.
-        recover: whether the policy corrects failed insertions.
+        recover: whether to correct failed insertions, take heaps apart and turn objects over.
     """
     # Import SciPy lazily.
     from kitting_drake.policies.matching.shape_matching import ShapeMatchingPolicy

@@ -47,7 +47,7 @@ class Decision:
     log_odds: float | None = None
     """The log-odds that there is something to pick; None if the networks do not predict it."""
     belongs: bool = False
-    """Whether the outlines show that the object belongs at its place."""
+    """Whether the outlines show that the object fits into the recess at its place."""
     moved_pick: float = 0.0
     """How far the stages moved the pick from the networks' proposal, in mm."""
     moved_place: float = 0.0
@@ -67,7 +67,7 @@ class Decision:
 
 
 DEFAULT_STAGES: tuple[Stage, ...] = (SubPixel(), StopRule())
-"""The stages of a policy that knows nothing about its task."""
+"""The stages that suit every task."""
 
 
 class LearnedPolicy:
@@ -86,7 +86,7 @@ class LearnedPolicy:
         Args:
             networks: networks that are prepared for inference. The stage `StopRule` uses their
                 `stop_threshold`.
-            orientations: N, the number of orientations.
+            orientations: N, the number of orientations in a full turn.
             stages: the stages, in the order in which they are applied (see `make_stages`). Without
                 stages this is the paper's policy, whose actions are quantized to pixels and bins.
             resolution: the side of a pixel in training, in metres; None if unknown.
@@ -116,8 +116,8 @@ class LearnedPolicy:
     def act(
         self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()
     ) -> tuple[PickPlaceAction, Decision | None]:
-        """Returns the action and its decision. The decision is None for an action that corrects an
-        earlier failure.
+        """Returns the action and its decision. The decision is None for an action of the stage
+        `Recovery`.
 
         The arguments are those of `__call__`.
         """
@@ -134,8 +134,8 @@ class LearnedPolicy:
         return decision.action, decision
 
     def decide(self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()) -> Decision:
-        """Returns the networks' action and its distributions, without corrections of earlier
-        failures.
+        """Returns the networks' action and its distributions, even if the stage `Recovery` would
+        replace the action.
 
         The arguments are those of `__call__`.
         """

@@ -56,7 +56,7 @@ def make_stages(
         continuous: whether to refine actions beyond the networks' pixels and bins.
         fit_outlines: whether to refine actions by the geometry of o_t as well; used only with
             `continuous`.
-        recover: whether to correct failed insertions.
+        recover: whether to correct failed insertions, take heaps apart and turn objects over.
         may_stop: whether to stop when there is nothing left to pick.
     """
     outlines = insertion and continuous and fit_outlines
@@ -215,7 +215,7 @@ class BelongingFirst:
 
 @dataclass(frozen=True)
 class StopRule:
-    """Stops when the networks' log-odds of something to pick are below their threshold."""
+    """Stops when the networks' log-odds that something is left to pick are below the threshold."""
 
     def refine(self, draft: Draft) -> Draft:
         odds, threshold = draft.look.picking.log_odds, draft.look.networks.stop_threshold
@@ -231,9 +231,11 @@ class OutlineStop:
     - An object that fits into a recess is picked, even if the networks predict that nothing is
       left.
     - A region that may contain such an object (`Inventory.worth_a_try`) is picked if the networks'
-      log-odds of something to pick are above the threshold.
-    - Any other object is picked only if the log-odds are far above the threshold. An object that
-      lies upside down is never picked.
+      log-odds that something is left to pick reach the threshold.
+    - Any other object is picked only if the log-odds exceed the threshold by `_NOTHING_FITS` or, in
+      a scene without a fixture, reach the threshold.
+    - An object that lies upside down, or should not be tried again (`Inventory.is_tried`), is not
+      picked.
     """
 
     def refine(self, draft: Draft) -> Draft:

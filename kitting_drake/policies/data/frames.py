@@ -46,11 +46,10 @@ class FrameSettings:
     width: int = DEFAULT_WIDTH
     """Largest width of the images, in pixels."""
     cameras: tuple[str, ...] = ()
+    """Names of the cameras to record; empty for all cameras of the scenario."""
 
     def __post_init__(self) -> None:
-        """Raises:
-        UserError: the rate or the width cannot be used.
-        """
+        """Raises UserError if the rate or the width cannot be used."""
         if self.fps not in RATES:
             raise UserError(f"fps is {self.fps}: use {RATES[0]} to {RATES[-1]}")
         if self.width < 16:

@@ -74,7 +74,7 @@ def export_lerobot(
     about: dict[str, Any] | None = None,
     track: Track = iter,
 ) -> None:
-    """Writes episodes as a LeRobotDataset, one by one, atomically.
+    """Writes episodes as a LeRobotDataset, atomically. Only one episode at a time is in memory.
 
     A folder that already holds this export is left unchanged.
 

@@ -47,7 +47,8 @@ class Stored:
             values = self.file[self.dataset][() if self.row is None else self.row]
         except (OSError, LookupError, RuntimeError) as error:
             raise UserError(
-                f"cannot read the demonstration {self.dataset} again: its file is damaged"
+                f"cannot read the demonstration {self.dataset} again, because its file is damaged: "
+                "collect again"
             ) from error
         return np.asarray(values, dtype)
 

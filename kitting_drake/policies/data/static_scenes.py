@@ -158,12 +158,15 @@ def read_static_scenes(path: Path) -> StaticScenes:
     try:
         with h5py.File(path) as file:
             if file.attrs.get("format") != FORMAT:
-                raise UserError(f"{path} is not a file of static scenes")
+                raise UserError(
+                    "it is not a file of static scenes: make one with "
+                    "python -m kitting_drake.draw_scenes"
+                )
             version = file.attrs["format_version"]
             if version != FORMAT_VERSION:
                 raise UserError(
-                    f"{path} has format version {version}, but version {FORMAT_VERSION} is "
-                    "needed: draw the scenes again"
+                    f"it has format version {version}, but version {FORMAT_VERSION} is needed: "
+                    "draw the scenes again"
                 )
             grid = PixelGrid(**json.loads(file.attrs["grid"]))
             heights, actions, first = (file[key][()] for key in ("height", "actions", "first"))
