@@ -1,6 +1,6 @@
 """Errors that a user can fix."""
 
-DIVERGED = "a loss is no longer a number"
+DIVERGED = "a loss is no longer finite"
 """Message of the error that ends a training run that has diverged."""
 
 

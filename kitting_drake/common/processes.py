@@ -24,8 +24,8 @@ _Result = TypeVar("_Result")
 _THREADS = "OMP_NUM_THREADS"
 
 _MOST_CALLS = 10
-"""A process is replaced after this many calls: Drake 1.51 never frees Diagrams, which take about
-50 MB for each episode."""
+"""A process is replaced after this many calls, because Drake 1.51 (for Python 3.11) never frees
+Diagrams, which take about 50 MB for each episode."""
 _PATIENCE = 3.0
 """Time for a stopped process to remove partial files, in s."""
 _MOST_AT_WORK = 1000
@@ -37,7 +37,7 @@ class ProcessCrashed:
     """A process that ended without a result."""
 
     exit_code: int | None
-    """Exit code of the process. A negative number is that of the signal that killed it."""
+    """Exit code of the process; if signal n killed it, -n."""
 
     @property
     def was_killed(self) -> bool:

@@ -112,7 +112,8 @@ def add_picture_renderer(scene_graph: SceneGraph) -> str:
 
 
 def add_film_renderer(scene_graph: SceneGraph) -> str:
-    """Adds the render engine for videos, fast and with the light of pictures. Returns its name.
+    """Adds the render engine for videos: it has the lights of `add_picture_renderer` but, to be
+    fast, no ambient occlusion. Returns its name.
 
     Raises:
         MachineError: this machine cannot render.

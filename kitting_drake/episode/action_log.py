@@ -152,7 +152,7 @@ def _place_errors(
     item: PlacedObject, goal: Goal, X_WGoal: RigidTransform, arrival: RigidTransform
 ) -> tuple[float, float, float]:
     """Returns the mean displacement (m), the distance of the middles (m) and the angle (rad)
-    between an object's pose and its goal.
+    between an object's pose after the action and its goal.
 
     Only the planar arrival pose is known, so heights are not compared.
     """

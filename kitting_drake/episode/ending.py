@@ -82,7 +82,7 @@ def is_right(reason: str, station: KittingStation, root_context: Context) -> boo
     goal. Whether a goal is filled is decided by the task's measure of success.
 
     - `done`: right if nothing is left to do.
-    - `nothing fits`: right if nothing is left to do, but an object or a goal is left.
+    - `nothing fits`: right if an object or a goal is left, but no object fits an unfilled goal.
     - All others (`gave up`, `not sure`, `not seen`, `no kit seen`, `actions spent`, `time`,
       `failure`): right if something is left to do.
 

@@ -17,8 +17,8 @@ from systems.trajectory_controller import FINGERS
 
 
 def chosen_cameras(recording: FrameSettings, cameras: dict[str, Any]) -> tuple[str, ...]:
-    """The names of the recorded cameras. If the recording names none, they are all cameras of the
-    scenario.
+    """The names of the cameras to record: those that `recording` names or, if there are none, all
+    cameras of the scenario.
 
     Raises:
         UserError: a name is unknown.
@@ -39,7 +39,7 @@ class JointView:
             recording: the settings, which name cameras and image size.
 
         Raises:
-            UserError: there is no such camera.
+            UserError: the settings name an unknown camera.
         """
         self._station, self._recording = station, recording
         self.cameras = chosen_cameras(recording, station.scenario.cameras)

@@ -1,1 +1,1 @@
-"""Static training scenes, rendered without physics."""
+"""Static training scenes: random tools and kits, rendered without running episodes."""

@@ -1,9 +1,10 @@
-"""Draws static training scenes: random tools and kits, rendered without physics.
+"""Draws static training scenes: random tools and kits, rendered without running episodes.
 
 For each batch, random tools are drawn (`hkd.generation.random_tools`). Each kit is laid out for
 some of these tools and rendered in several scenes, which differ in poses, seated tools, clutter and
-camera noise. The labels follow from the geometry: all grasps at which the jaws have room, and the
-pose at which a tool is seated.
+camera noise. Physics is used only to let crossed, leaning and heaped tools come to rest. The labels
+follow from the geometry: all grasps at which the jaws have room, and the pose at which a tool is
+seated.
 """
 
 from collections.abc import Iterator, Sequence

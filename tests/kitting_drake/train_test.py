@@ -688,7 +688,7 @@ def test_a_damaged_checkpoint_is_refused(
 
 def test_a_nan_loss_ends_the_run(demos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(Trainer, "step", lambda *_: {"place": float("nan")})
-    with pytest.raises(UserError, match="no longer a number at step 0: lower --learning-rate"):
+    with pytest.raises(UserError, match="no longer finite at step 0: lower --learning-rate"):
         train(demos, tmp_path)
     assert not (tmp_path / "checkpoint.pt").exists()
 
