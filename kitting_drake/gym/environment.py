@@ -44,7 +44,7 @@ class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
       left, or the simulation failed (`info["failure"]`).
     - `info`: the present values of the keys of `results.json`, without `wall_seconds`, which would
       not be reproducible; `failed_picks`, (x, y, theta) of each failed grasp; and `history`, the
-      earlier actions as dicts with the keys `action`, `outcome` and `peak_force` (N).
+      last 64 actions as dicts with the fields of `systems.signals.Attempt`.
     - `reset(seed=N)` makes the scene of seed N, as in `evaluate` and `run`. Without a seed, it
       chooses one at random. `info["seed"]` holds the seed. `reset` has no `options`, and warns of
       any that are given.
@@ -190,7 +190,7 @@ class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         return render_picture(scene_graph, context, self._station.X_WOverview)
 
     def close(self) -> None:
-        """Frees the simulation. With Python 3.11, Drake 1.51 leaks about 35 MB nevertheless."""
+        """Frees the simulation. Drake 1.51 (for Python 3.11) still keeps about 35 MB in memory."""
         self._station = self._episode = None
         # A Diagram and its systems form reference cycles, which only the garbage collector frees.
         gc.collect()

@@ -30,7 +30,7 @@ def observation_space(scenario: Scenario, *, cameras: bool) -> spaces.Dict:
     """Returns the space of observations, which are dicts with these keys, as in `Observation`:
 
     - `colour` (rows, cols, 3);
-    - `height` (rows, cols), in metres above the table;
+    - `height` (rows, cols), in metres above `heightmap.z_min`, by default the table;
     - `valid` and `in_view` (rows, cols);
     - `cameras`, if it is requested: for each camera `colour` (height, width, 3), and `depth`
       (height, width) in metres, which is 0 for points that are too near and infinite for points
