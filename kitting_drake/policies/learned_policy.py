@@ -49,9 +49,9 @@ class Decision:
     belongs: bool = False
     """Whether the outlines show that the object fits into the recess at its place."""
     moved_pick: float = 0.0
-    """How far the stages moved the pick from the networks' proposal, in mm."""
+    """How far the stages moved the pick from the networks' proposal, in mm; at most 40."""
     moved_place: float = 0.0
-    """How far the stages moved the place from the networks' proposal, in mm."""
+    """How far the stages moved the place from the networks' proposal, in mm; at most 20."""
     geometry: Evidence = dataclasses.field(default_factory=dict)
     """Geometric facts about the action (`geometric_evidence`); empty if outlines are not used."""
     kit_seen: bool | None = None

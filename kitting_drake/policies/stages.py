@@ -29,9 +29,9 @@ and its place is within `_SAME_PLACE`."""
 _SAME_PLACE = 4.0
 """The largest distance, in pixels, between the places of rotations that count as equally good."""
 _TRIES = 4
-"""The largest number of picks that are checked for being seen well enough."""
+"""The policy stops after this many picks that are not seen well enough."""
 _ANOTHER = 0.010
-"""The least distance, in metres, between a pick and the next one that is tried."""
+"""After a pick that is not seen well enough, the next is farther away than this, in metres."""
 _NOTHING_FITS = 2.0
 """How much the stop threshold is raised if the outlines show nothing to pick, in nats.
 

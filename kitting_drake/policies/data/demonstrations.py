@@ -45,7 +45,7 @@ class Demonstration:
 
     seed: int
     score: float
-    """The share of the objects that were placed."""
+    """The task's reward at the end, from 0 to 1."""
     steps: tuple[DemonstrationStep, ...]
     final: FinalObservation | None = None
     """The observation at the end; None if the episode ended before the hand was ready for another
@@ -58,7 +58,7 @@ class Demonstration:
 
 @dataclass(frozen=True)
 class Rejection:
-    """A seed whose episode scored too low to learn from."""
+    """A seed without a demonstration, because its episode is unsuitable for learning."""
 
     seed: int
     score: float

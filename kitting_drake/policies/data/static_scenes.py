@@ -58,7 +58,7 @@ class StaticScene:
     height: NDArray[np.uint16]
     """(rows, cols) heights above the table, in steps of 0.1 mm."""
     actions: NDArray[np.float64]
-    """(m, 8) the scene's actions, one in each row, with the columns of the file."""
+    """(m, 8) the scene's actions, one in each row; for the columns see the module's docstring."""
 
     @classmethod
     def of(cls, observation: Observation, actions: NDArray[np.float64]) -> StaticScene:

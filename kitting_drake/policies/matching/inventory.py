@@ -14,8 +14,8 @@ from kitting_drake.policies.matching.splitting import split_touching
 from systems.signals import Attempt, LeftOver, Observation, PlanarPose
 
 _THERE = 0.015
-"""The radius, in metres, around an earlier pick or place within which an object counts as the one
-that was moved."""
+"""An object within this distance of an earlier pick or place, in metres, counts as the one that was
+moved."""
 _MOST_TRIES = 3
 """An object is tried at most this many times."""
 _LEAST_SHARE = 0.5

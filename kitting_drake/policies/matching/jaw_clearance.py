@@ -23,7 +23,7 @@ from systems.signals import PixelGrid, PlanarPose
 Array = NDArray[np.float64]
 
 RETRY_DISTANCE = 0.010
-"""The radius, in metres, around a failed grasp within which no grasp is tried again."""
+"""No grasp is tried within this distance of a failed one, in metres."""
 _ANGLES = 36
 _MOST_PLACES = 80
 _REACH = 0.055

@@ -31,10 +31,10 @@ _SUPPORT_PERCENTILE = 10.0
 """The percentile of the heights around the pick that is taken as the height of the object's
 support."""
 _UNDER = 0.009
-"""Half the side, in metres, of the square around the place whose highest point is taken as the
-height of the support there."""
+"""Half the side, in metres, of a square around the place. Its highest point is taken as the height
+of the support there."""
 _LEAST = 0.004
-"""The least height of an obstacle above the fingertips, in metres."""
+"""An obstacle is higher than the fingertips by more than this, in metres."""
 
 
 def blocked_at_place(

@@ -42,8 +42,8 @@ _RIM = 1.5
 _INSIDE = 0.94
 """The least share of a recess's area that must lie within the region."""
 _NEAR = 0.0025
-"""The largest distance, in metres, at which a point of an object's outline counts as shared with
-the region's outline."""
+"""A point of an object's outline is shared with the region's outline if it is less than this far
+from it, in metres."""
 _SHARED = 0.45
 """The least share of an object's outline that must be shared with the region's outline."""
 _COST = 0.0010

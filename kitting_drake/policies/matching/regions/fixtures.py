@@ -22,7 +22,7 @@ _MOST_FIXTURES = 4
 _COMPARABLE = 0.3
 """The least area of a further fixture, as a share of the largest fixture's area."""
 PLANE_BAND = 0.004
-"""The largest distance, in metres, from a plane at which a pixel belongs to it."""
+"""A pixel belongs to a plane if its height differs from it by less than this, in metres."""
 _LEAST_FIXTURE_HEIGHT = 0.015
 """The least height of a fixture above the table, in metres."""
 _LEAST_FIXTURE_AREA = 0.003
@@ -42,9 +42,9 @@ _USUAL_PIXEL = 0.003125
 """The side of the pixels, in metres, for which the least areas are chosen. Noise affects a few
 pixels of any size, so the least areas are reduced for smaller pixels."""
 _CLOSING = 0.0094
-"""Half the width, in metres, of the widest gap in a plateau that is closed."""
+"""Gaps in a plateau are closed if they are narrower than twice this, in metres."""
 CLEAN = 0.0005
-"""The largest standard deviation of the noise, in metres, at which heights are not filtered."""
+"""Heights are filtered only if the standard deviation of their noise exceeds this, in metres."""
 _LEVEL = math.tan(math.radians(0.7))
 """The slope below which a plateau counts as level."""
 _TILT_ROUNDS = 3
