@@ -9,7 +9,7 @@ COMMANDS = {
     "run": "run one episode, show it in Meshcat, save a replay",
     "evaluate": "run many seeds in parallel and summarise them",
     "collect": "collect demonstrations of the oracle in one file",
-    "draw_scenes": "draw static scenes of random tools, for training without physics",
+    "draw_scenes": "draw static scenes of random tools, for training without demonstrations",
     "train": "train networks from demonstrations or static scenes",
     "decide": "decide one pick and place from a real camera's frames",
     "demonstrate": "convert frames and actions of a real bench to demonstrations",

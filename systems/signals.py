@@ -88,7 +88,7 @@ class Observation:
     """o_t of the paper (section III-A): the workspace seen orthographically from above."""
 
     image: NDArray[np.float32] = field(default_factory=lambda: np.zeros((4, 160, 320), np.float32))
-    """(4, rows, cols): red, green, blue in [0, 1], and height above the table in metres. Unseen
+    """(4, rows, cols): red, green, blue in [0, 1], and height above `grid.z_min` in metres. Unseen
     pixels are zero in all four channels."""
     grid: PixelGrid = field(default_factory=PixelGrid)
     valid: NDArray[np.bool_] = None  # type: ignore[assignment]
@@ -116,7 +116,7 @@ class Observation:
 
     @property
     def height(self) -> NDArray[np.float32]:
-        """(rows, cols) heights in metres above the table."""
+        """(rows, cols) heights in metres above `grid.z_min`."""
         return self.image[3]
 
     @cached_property
