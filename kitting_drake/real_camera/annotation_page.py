@@ -45,13 +45,14 @@ _HOST = "127.0.0.1"
 _LONGEST = 100_000
 """The largest size of an action in JSON, in bytes."""
 _LEAST_RANGE = 0.02
-"""The least height that is drawn white, in metres. It keeps the noise of an empty table dark."""
+"""The height that is drawn white is at least this, in metres, so that the noise of an empty table
+stays dark."""
 _UNSEEN = np.array([60, 0, 90], np.uint8)
 """The colour (RGB) of pixels that no camera sees."""
 
 
 class AnnotationServer(ThreadingHTTPServer):
-    """A server of the page; `serve_forever` runs it until it is shut down."""
+    """The HTTP server of the annotation page; `serve_forever` runs it until it is shut down."""
 
     def __init__(self, steps: Sequence[StepFolder], calibration: Calibration, port: int = 0):
         """Opens the port.
@@ -140,7 +141,7 @@ class _Handler(BaseHTTPRequestHandler):
         """Serves the page, the steps, or an image."""
         image = re.fullmatch(r"/steps/(\d+)/(color|height)\.png", self.path)
         if not self._is_local():
-            self._fail(HTTPStatus.FORBIDDEN, "the page is for this machine only")
+            self._fail(HTTPStatus.FORBIDDEN, "open the page as 127.0.0.1 or localhost")
         elif self.path == "/":
             self._send("text/html; charset=utf-8", _PAGE.read_bytes())
         elif self.path == "/steps":

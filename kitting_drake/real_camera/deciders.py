@@ -23,7 +23,7 @@ from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
 
 Draw = Callable[[str], bytes]
-"""A function that draws a decision, with a title, as a PNG."""
+"""A function that draws a decision as a PNG, with a given title."""
 
 
 def _draw_nothing(title: str) -> bytes:
@@ -38,10 +38,9 @@ class Choice:
     confidence: float | None
     """The confidence from 0 to 1; None if the policy estimates none for this action."""
     parts: dict[str, float] = field(default_factory=dict)
-    """The certainty of the networks, by part; see `certainty`."""
+    """The networks' certainty of each part of the decision, from 0 to 1; see `certainty`."""
     draw: Draw = _draw_nothing
-    """Draws the decision as a PNG with a given title; an empty title stands for the kind of
-    action."""
+    """Draws the decision as a PNG with a given title; an empty title selects the default one."""
     reason: str = ""
     """A sentence that says why the policy acts or stops; empty if `action.reason` says it."""
 
@@ -134,8 +133,9 @@ class _Networks:
         if action.stop:
             return Choice(action, parts.get("nothing_to_pick"), parts, draw)
         if decision.kit_seen is None:
-            # The fitted confidence is for decisions by outlines. For other decisions use the
-            # networks' own certainty, and refuse nothing unless the caller sets a threshold.
+            # The fitted confidence holds only for decisions that use outlines. For other decisions
+            # use the networks' own certainty, and act at any certainty unless the caller sets a
+            # threshold.
             return _if_sure(
                 math.prod(parts.values()), self.least_confidence or 0.0, action, parts, draw
             )
@@ -156,7 +156,7 @@ def _if_sure(
     if confidence >= least:
         said = f"the probability of success is {confidence:.2f}"
         return Choice(action, confidence, parts, draw, said)
-    said = f"the best pick and place has a probability of {confidence:.2f}, less than {least:.2f}"
+    said = f"the best action succeeds with probability {confidence:.2f}, less than {least:.2f}"
     return Choice(PickPlaceAction(stop=True, reason="not sure"), confidence, parts, draw, said)
 
 

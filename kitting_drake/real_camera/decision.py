@@ -1,4 +1,4 @@
-"""Turns camera frames into an action in the robot's base frame, with its heights."""
+"""Turns camera frames into an action in the robot's base frame, and the heights of its motion."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ from systems.signals import (
 from systems.surface_heights import read_surface_heights
 
 _SEEN_TO_STOP = 0.7
-"""The least measured share of the pixels in view at which a policy may say that nothing is left to
-do. If less is measured, an object may be hidden, and the result is `not seen`."""
+"""A policy may report that nothing is left to do only if at least this share of the pixels in view
+has a measured height. With less, an object may be hidden, and the result is `not seen`."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class BenchDecision:
     observation: Observation
     """The observation o_t."""
     seen: float
-    """The measured share, from 0 to 1, of o_t's pixels in view of the cameras."""
+    """The share, from 0 to 1, of o_t's pixels in view that have a measured height."""
     choice: Choice
     surfaces: SurfaceHeights
     heights: MotionHeights

@@ -37,7 +37,7 @@ TASK = "bench"
 """The task name in the origin of demonstrations from real cameras; simulated ones have other
 names."""
 _FIRST_SEED = VALIDATION_SEEDS.stop
-"""The first seed that no simulated episode has."""
+"""The first seed above those of all simulated episodes."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class StepFolder:
 
     @property
     def name(self) -> str:
-        """The names of the demonstration and of the step."""
+        """The names of the demonstration's and the step's folders, as `demonstration/step`."""
         return f"{self.path.parent.name}/{self.path.name}"
 
 
@@ -143,7 +143,9 @@ def check_action(step: StepFolder, action: StepAction, calibration: Calibration)
 
 
 def check_replaceable(path: Path, folder: Path) -> None:
-    """Checks that a file, if it exists, holds demonstrations from a folder of the same name.
+    """Checks that a file may be replaced by the demonstrations of a folder.
+
+    It may if it does not exist, or if it holds demonstrations from a folder of the same name.
 
     Raises:
         UserError: the file holds something else.
@@ -167,7 +169,7 @@ def convert(folder: Path, calibration: Calibration, learning: Learning, path: Pa
     Args:
         folder: the demonstrations; see `find_demonstrations`.
         calibration: the cameras' calibration, the same for all demonstrations.
-        learning: the assumptions that training may make.
+        learning: the assumptions about the task that training may make.
         path: the file to write.
 
     Raises:

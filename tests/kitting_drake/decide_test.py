@@ -465,8 +465,8 @@ def test_missing_depths_are_unseen_pixels():
         (spoil(lambda depth: 1000 * depth), "seem to be millimetres"),
         (as_png(1.0), "seem to be metres"),
         (as_png(4000.0), "depth_scale: 0.00025 would agree"),
-        (spoil(lambda depth: 0 * depth), "depth of camera front is all zero or NaN"),
-        (spoil(lambda depth: np.nan * depth), "depth of camera front is all zero or NaN"),
+        (spoil(lambda depth: 0 * depth), "depth of camera front is zero or NaN"),
+        (spoil(lambda depth: np.nan * depth), "depth of camera front is zero or NaN"),
     ],
 )
 def test_implausible_depths_are_no_action(
@@ -538,7 +538,7 @@ def test_frames_may_be_pairs_of_files(bench: Path):
         read_frames(files[:2], TRUE)
     with pytest.raises(UserError, match="are both colour"):
         read_frames([files[1]] * 6, TRUE)
-    with pytest.raises(UserError, match="there is no frame"):
+    with pytest.raises(UserError, match="there is no file"):
         read_frames([bench / "nowhere"], TRUE)
 
 

@@ -131,8 +131,8 @@ class Calibration:
     outline: TableOutline = dataclasses.field(default_factory=TableOutline)
     """The part of the workspace that is table."""
     verified: bool = False
-    """Whether x, y, yaw and the orientation of the image were checked. Images of a bare table do
-    not show errors in these."""
+    """Whether the poses' x, y and yaw, and the orientation of the images, were checked. Images of a
+    bare table do not show errors in these."""
 
     @cached_property
     def region(self) -> NDArray[np.bool_] | None:
@@ -196,7 +196,7 @@ def read_calibration(
         # A file of another tool may describe a whole camera.
         content = lens_of_mapping(content, str(path))
         entries = {str(content.get("camera_name", "camera")): content}
-        # In a file with one camera, the fields of the bench are beside those of the camera.
+        # In a file with one camera, the fields for all cameras are beside those of the camera.
         beside = (*_BENCH_FIELDS, "camera_name")
     cameras = tuple(
         _read_camera(path, str(name), node, beside, poses) for name, node in entries.items()
@@ -377,7 +377,7 @@ def _lens_record(lens: Intrinsics) -> dict[str, Any]:
 
 
 def calibration_digest(calibration: Calibration) -> str:
-    """Returns a digest that is equal for equal calibrations in any layout.
+    """Returns a digest that is equal for equal calibrations in any layout. Ignores `verified`.
 
     Numbers are rounded to nine decimals, because the same rotation, given as a quaternion or as a
     matrix, may differ in the last bit.

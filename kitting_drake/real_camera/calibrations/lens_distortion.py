@@ -43,7 +43,7 @@ def known_model(name: object, where: str) -> str:
     key = str(name or "").strip().lower().replace(" ", "_").replace("-", "_")
     if key not in _MODELS:
         raise UserError(
-            f"{where}: distortion_model {name} cannot be read: rectify the images, and give "
+            f"{where}: distortion_model {name} is not supported: rectify the images, and give "
             "distortion: [] and no distortion_model"
         )
     return _MODELS[key]

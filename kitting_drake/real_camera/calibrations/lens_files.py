@@ -26,7 +26,7 @@ _PRINTED = re.compile(
 )
 """The text form of pyrealsense2.intrinsics."""
 _PYREALSENSE = {**{key: key for key in ("width", "height", "fx", "fy")}, "cx": "ppx", "cy": "ppy"}
-_RECTIFIED = ("none", "brown conrady", "")
+_PLUMB_BOB = ("none", "brown conrady", "")
 
 
 def read_lens_file(path: Path, stream: str, resolution: tuple[int, int] | None) -> dict[str, Any]:
@@ -211,7 +211,7 @@ def _librealsense(model: str, values: list[Any], where: str) -> dict[str, Any]:
     coefficients = numbers(values, f"{where}: coefficients")
     if not np.any(coefficients):
         return {"distortion": []}
-    if name in _RECTIFIED:
+    if name in _PLUMB_BOB:
         return {"distortion": coefficients.tolist(), "distortion_model": "plumb_bob"}
     if name.startswith("kannala"):
         coefficients = coefficients[:4]

@@ -25,7 +25,7 @@ Polygon = tuple[tuple[float, float], ...]
 
 OUTLINE_FIELDS = ("region", "ignore", "region_mask")
 _INLINE = "data:image/png;base64,"
-"""The beginning of an image that is contained in the YAML, as `write_calibration` writes it."""
+"""The prefix of an image that is embedded in the YAML, as `write_calibration` writes it."""
 _NOT_AN_IMAGE = (OSError, SyntaxError, ValueError, TypeError, Image.DecompressionBombError)
 
 

@@ -1,4 +1,4 @@
-"""Reads YAML and JSON files by OpenCV, ROS or people, and numbers from their values."""
+"""Reads YAML and JSON files that OpenCV, ROS or people wrote, and numbers from their values."""
 
 from __future__ import annotations
 

@@ -45,7 +45,8 @@ class TableCheck:
     noise: float
     """A robust estimate of the standard deviation of the heights, in metres."""
     holes: float
-    """The share of the table in view that has no depth."""
+    """The share, from 0 to 1, of the table without depth: of the part in view for one camera, and
+    of the whole table for o_t."""
 
     @property
     def tilt_angle(self) -> float:
@@ -156,7 +157,8 @@ def _is_verified(block: Block | None) -> bool:
 
 
 def levelled(X_BC: Array, plane: Plane, grid: PixelGrid) -> Array:
-    """Corrects a camera's pose (4, 4) so that the plane that it sees becomes the table."""
+    """Returns a camera's pose (4, 4), corrected so that the seen plane is level and as high as
+    the table."""
     R = plane.levelling()
     corrected = X_BC.copy()
     corrected[:3, :3] = R @ X_BC[:3, :3]

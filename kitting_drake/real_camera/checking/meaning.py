@@ -17,7 +17,7 @@ GOOD, TIGHT, BAD = "good", "tight", "too much"
 _HALF_KIT = 0.1
 """The distance from a kit's centre to its edge, in metres."""
 _OUT_OF_SCALE = 0.008
-"""The relative error of the scale up to which it may be noise."""
+"""A relative error of the scale below this may be noise."""
 _HALF_WORKSPACE = 0.5
 """Half the length of the workspace, in metres."""
 _LEVEL = math.radians(0.02)

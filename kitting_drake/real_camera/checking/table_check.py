@@ -40,11 +40,11 @@ _FARTHEST = 0.35
 _LEAST = 150
 """The least number of used pixels on a plane."""
 _BELOW = 0.5
-"""The least number of pixels on the plane at the table's height, as a share of the pixels on a
-plane below it."""
+"""The plane at the calibrated height counts as the table only if it has at least this share of the
+pixels of any plane below it."""
 _ABOVE = 0.08
-"""The least number of pixels on the plane at the table's height, as a share of the pixels on a
-plane above it. It is small, because large objects may hide most of a table."""
+"""The plane at the calibrated height counts as the table only if it has at least this share of the
+pixels of any plane above it. The share is small, because objects may hide most of a table."""
 _CURVED = 0.5
 """The depths are probably distances from the camera if their conversion to depths along the optical
 axis reduces the table's noise to less than this share."""
@@ -80,7 +80,7 @@ def check_table(frames: Mapping[str, Frame], calibration: Calibration) -> list[s
     """Checks that every camera sees the table level and at its height.
 
     Args:
-        frames: each camera's frame by its name, checked by `check_frame`.
+        frames: the frames that `check_frames` returns.
         calibration: the cameras' calibration.
 
     Returns:

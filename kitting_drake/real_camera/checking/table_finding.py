@@ -62,7 +62,7 @@ _CLOSED = 0.035
 and shadows."""
 _KIT = 0.03
 """Half the least width, in metres, of an object at the table's edge that counts as part of the
-table. Profiles along the edge are narrower."""
+table. Narrower things, such as profiles along the edge, do not count."""
 _LEAST_TALL = 0.02
 """The width below which tall things count as noise, in metres."""
 _AROUND = 0.02

@@ -36,7 +36,7 @@ class CalibrationError(UserError):
 
 
 def check_frames(frames: Mapping[str, Frame], calibration: Calibration) -> dict[str, Frame]:
-    """Returns the frames of all cameras, with contiguous arrays.
+    """Returns the checked frames of all cameras, with contiguous depths.
 
     Args:
         frames: each camera's frame by its name.
@@ -91,7 +91,7 @@ def make_views(frames: Mapping[str, Frame], calibration: Calibration) -> list[Vi
 def table_depth(
     camera: BenchCamera, calibration: Calibration, step: int = 1
 ) -> NDArray[np.float64]:
-    """Returns the depth (height, width) of the table in metres, by the camera's pose alone.
+    """Returns the table's depth (height, width) in metres that the camera's pose predicts.
 
     It is NaN for pixels that do not look at the workspace's table. Only every `step`th row and
     column is computed.
@@ -108,7 +108,7 @@ def table_depth(
 
 
 def seen_share(observation: Observation) -> float:
-    """Returns the measured share, from 0 to 1, of the pixels of o_t in view of any camera."""
+    """Returns the share, from 0 to 1, of o_t's pixels in view that have a measured height."""
     seen = observation.valid[observation.in_view]
     return float(seen.mean()) if seen.size else 0.0
 
@@ -179,7 +179,7 @@ def _check_depth(frame: Frame, camera: BenchCamera, calibration: Calibration) ->
         returned = np.isfinite(depth) & (depth > 0)
     if returned.mean() < _LEAST_DEPTH:
         raise CalibrationError(
-            f"depth of camera {camera.name} is all zero or NaN where it looks at the workspace: "
+            f"depth of camera {camera.name} is zero or NaN almost everywhere on the workspace: "
             "check the depth image, and the camera's pose"
         )
     ratios = depth[returned] / expected[towards][returned]

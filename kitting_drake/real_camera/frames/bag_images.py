@@ -43,7 +43,7 @@ def color_of_message(body: Any, where: str) -> NDArray[np.uint8]:
 
 
 def depth_of_message(body: Any, where: str) -> NDArray[Any]:
-    """Returns depth (height, width), as floats in metres or as whole steps.
+    """Returns depth (height, width), as floats in metres or as integers in steps of `depth_scale`.
 
     Raises:
         UserError: the encoding cannot be read. The message begins with `where`.

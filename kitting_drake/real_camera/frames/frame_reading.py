@@ -74,7 +74,7 @@ def read_frames(
     """
     for path in paths:
         if not path.exists():
-            raise UserError(f"there is no frame {path}")
+            raise UserError(f"there is no file or folder {path}")
     recordings = [path for path in paths if is_recording(path)]
     if recordings:
         if len(paths) > 1:

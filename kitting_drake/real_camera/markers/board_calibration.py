@@ -86,7 +86,7 @@ def _images(paths: Sequence[Path], camera: BenchCamera, lenses: Calibration) -> 
     alone = len(lenses.cameras) == 1
     for path in paths:
         if not path.exists():
-            raise UserError(f"there is no frame {path}")
+            raise UserError(f"there is no file or folder {path}")
     files = [path for path in paths if not path.is_dir()]
     if files and not alone:
         raise UserError(
@@ -117,8 +117,8 @@ def _calibrate_camera(board: Board, paths: Sequence[Path], camera: BenchCamera) 
         alone = max(item.rms for item in singles)
         if fit.rms > alone + _MOVED:
             raise UserError(
-                f"{where}: one pose errs by {fit.rms:.2f} pixels over all images, but a pose for "
-                f"each image by at most {alone:.2f}: did the board or the camera move between them?"
+                f"{where}: one pose for all images is off by {fit.rms:.2f} pixels, one for each by "
+                f"at most {alone:.2f}: did the board or the camera move between them?"
             )
     corners = sum(len(item.points) for item in seen)
     return CalibratedCamera(camera.name, images[0], seen[0], len(paths), corners, fit)

@@ -25,8 +25,8 @@ corners are poor."""
 _SAME = math.radians(1)
 """The angle in radians below which two poses count as the same."""
 _CLEARER = 16.0
-"""A pose is ambiguous if, at another pose, the sum of the corners' squared errors is larger by less
-than this multiple of a corner's variance."""
+"""A pose is ambiguous if another pose raises the sum of the corners' squared errors by less than
+this multiple of the variance of one corner."""
 _LIKELY = 0.2
 """The error of corners that is expected in a real image, in pixels."""
 _NOISE = 0.05
@@ -48,7 +48,7 @@ class BoardFit:
     focal_ratio: float
     """The factor for the focal length that would explain the corners best."""
     focal_error: float
-    """The standard deviation of this factor."""
+    """The standard deviation of `focal_ratio`."""
 
 
 def fit_board(points: Array, pixels: Array, lens: Intrinsics, where: str) -> BoardFit:
@@ -114,8 +114,8 @@ def _starts(points: Array, pixels: Array, lens: Intrinsics, where: str) -> list[
 
 
 def _refined(start: Array, points: Array, pixels: Array, lens: Intrinsics) -> tuple[Array, float]:
-    """Minimizes the corners' error, from the pose `start` on. Returns the pose found, and its root
-    mean square error in pixels."""
+    """Returns the pose (4, 4) that minimizes the corners' error, and its root mean square error in
+    pixels. The search begins at the pose `start`."""
     first = np.concatenate([Rotation.from_matrix(start[:3, :3]).as_rotvec(), start[:3, 3]])
     found = least_squares(_errors, first, args=(points, pixels, lens), method="lm", x_scale="jac")
     X = assembled(Rotation.from_rotvec(found.x[:3]).as_matrix(), found.x[3:6])

@@ -53,7 +53,7 @@ class BenchRobot:
         return tuple(f"{self.model}_joint{number}" for number in range(1, JOINTS + 1))
 
     def as_dict(self) -> dict[str, Any]:
-        """Returns the content of the arm's file."""
+        """Returns the content of the arm's file, without its rate."""
         base = self.base
         record: dict[str, Any] = {
             "model": self.model,

@@ -253,7 +253,7 @@ K = "width: 64\n    height: 48\n    k: [50, 0, 31.5, 0, 51, 23.25, 0, 0, 1]\n"
         (K + "    roi: {x_offset: 8, y_offset: 0, width: 32, height: 48}\n", "images are cropped"),
         (K + "    distortion_model: equidistant\n", "equidistant needs four numbers"),
         (K + "    distortion_model: equi\n    d: [0.1, 0]\n", "d must hold 4 numbers, not 2"),
-        (K + "    distortion_model: omni\n    d: [0.1, 0]\n", "distortion_model omni cannot be"),
+        (K + "    distortion_model: omni\n    d: [0.1, 0]\n", "distortion_model omni is not"),
         (K + "    image_Width: 64\n", "has width and image_Width: give one of them"),
         (K + "    camera_to_hand: tf\n", "has pose and camera_to_hand: give only one pose"),
         ("intrinsics: lens\n    camera_info: lens\n", "has camera_info and intrinsics: give one"),

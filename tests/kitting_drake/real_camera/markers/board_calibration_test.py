@@ -332,5 +332,5 @@ def test_files_are_of_the_only_camera(tmp_path: Path):
         UserError, match=r"is an image of one camera, but the calibration has 2 cameras: give fold"
     ):
         calibrate_cameras(board, [tmp_path / "frame1" / "front_color.png"], lens)
-    with pytest.raises(UserError, match="there is no frame"):
+    with pytest.raises(UserError, match="there is no file"):
         calibrate_cameras(board, [tmp_path / "nothing"], lens)
