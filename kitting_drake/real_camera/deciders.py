@@ -77,6 +77,7 @@ class ShapeMatchingDecider:
     """The training-free policy, which matches outlines (see `ShapeMatchingPolicy`)."""
 
     recover: bool = False
+    """Whether to correct failed insertions; see `Recovery`."""
     parameters: PickPlaceParameters = field(default_factory=PickPlaceParameters)
     """The parameters of the robot's motion; give `decide` the same."""
     least_confidence: float | None = None

@@ -43,6 +43,7 @@ class Finding:
     what: str
     value: str
     verdict: str
+    """The verdict on the value: `GOOD`, `TIGHT` or `BAD`."""
     meaning: str
 
 

@@ -161,7 +161,7 @@ def _check_pose(camera: BenchCamera, grid: PixelGrid) -> None:
         x, y, _ = X_BC[:3, 3] + X_BC[:3, 2] * (grid.z_min - X_BC[2, 3]) / X_BC[2, 2]
         hint = f"it looks at ({x:.2f}, {y:.2f}) m on the table"
     raise CalibrationError(
-        f"by its pose camera {camera.name} sees nothing of the workspace "
+        f"camera {camera.name}, at its calibrated pose, sees nothing of the workspace "
         f"({grid.x_min:g} to {grid.x_max:g}, {grid.y_min:g} to {grid.y_max:g} m): {hint}"
     )
 
@@ -189,7 +189,8 @@ def _check_depth(frame: Frame, camera: BenchCamera, calibration: Calibration) ->
         return
     found = float(np.median(depth[returned]))
     told = (
-        f"depth of camera {camera.name} has a median of {found:.3g} m, where by its pose the table"
+        f"the median depth of camera {camera.name} is {found:.3g} m, but at its calibrated pose "
+        "the table"
     )
     told += f" is {found / ratio:.3g} m away"
     if 500 < ratio < 2000:

@@ -144,8 +144,8 @@ def read_board(path: Path) -> Board:
     )
     if board.tilt > _LEVEL:
         raise UserError(
-            f"{path}: by its pose the board is tilted by {math.degrees(board.tilt):.1f} degrees: "
-            "it must lie flat on the table, with the print and its z up"
+            f"{path}: the board's pose is tilted by {math.degrees(board.tilt):.1f} degrees: it "
+            "must lie flat on the table, with the print and its z up"
         )
     return board
 

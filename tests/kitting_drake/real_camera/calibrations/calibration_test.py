@@ -153,7 +153,7 @@ def test_a_written_calibration_reads_back_exactly(tmp_path: Path):
             ("0.001, -0.002, 0.01]", "0.001]"),
             "must hold 0, 4, 5, 8, 12 or 14 numbers, not 3",
         ),
-        (("[0.1, -0.05,", "[-9.0, -0.05,"), "its distortion cannot be inverted"),
+        (("[0.1, -0.05,", "[-9.0, -0.05,"), "distortion of camera eye cannot be inverted"),
         ((", rpy_deg: [180, 0, -90]", ""), "camera eye: pose has no rotation"),
         (("rpy_deg: [180, 0, -90]", "yaw: 3"), "camera eye: pose has the unknown field 'yaw'"),
         (
