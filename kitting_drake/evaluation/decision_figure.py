@@ -41,7 +41,8 @@ def draw_decision(observation: Observation, decision: Decision, *, title: str = 
     Args:
         observation: the observation on which the decision is based.
         decision: the decision of a learned policy.
-        title: the title of the picture; empty for the kind of action.
+        title: the title of the picture; empty for the kind of action with its log-odds, if the
+            networks predict them.
 
     Returns:
         The picture as PNG.
@@ -158,8 +159,10 @@ def _draw_observation(colour: Axes, height: Axes, observation: Observation) -> N
 
 
 def _title(decision: Decision) -> str:
-    """A title with the kind of action and its log-odds; empty if the networks do not predict
-    log-odds."""
+    """Returns a title with the kind of action, and the log-odds that there is something to pick.
+
+    If the networks do not predict log-odds, the title is "stop" or empty.
+    """
     said = "stop" if decision.stop else "pick and place"
     if decision.log_odds is None:
         return said if decision.stop else ""

@@ -1,4 +1,4 @@
-"""Draws the proposed workspace and region, seen from above."""
+"""Draws the workspace and region that `find_table` proposes, seen from above."""
 
 from __future__ import annotations
 

@@ -169,7 +169,8 @@ def prove_kit(
         The verdict, in a sentence or two.
 
     Raises:
-        UserError: the table has no room for the kit and its tools.
+        UserError: the simulation failed, for example because the table has no room for the kit and
+            its tools.
     """
     record = json.loads((folder / "kit.json").read_text())
     own = 1e3 * float(record["kit_parameters_m"]["clearance"])

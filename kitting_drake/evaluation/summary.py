@@ -35,7 +35,8 @@ tolerates, with the limit for a strict success. The angle is modulo the object's
 symmetry."""
 
 _FAILED_GRASPS = ("missed", "dropped", "stopped")
-"""The outcomes of an action whose grasp was missed or lost, or that the force guard stopped."""
+"""The outcomes of actions that count as failed grasps: the grasp was missed or lost, or the force
+guard stopped the action."""
 
 ERRORS = ("add_s_mm", "position_error_mm", "angle_error_deg", "height_error_mm")
 """Keys of the errors of an object's final pose."""
@@ -149,8 +150,8 @@ def _stop_reasons(episodes: Sequence[Episode]) -> dict[str, dict[str, int]]:
 
 
 def peak_forces(episodes: Sequence[Episode]) -> list[Entry]:
-    """An entry for each action. Its `force` is the larger of the action's vertical and lateral peak
-    force, in N."""
+    """An entry for each action with recorded forces. Its `force` is the larger of the action's
+    vertical and lateral peak force, in N."""
     peaks = [
         action.get("peak_force_n") for episode in episodes for action in episode["actions_taken"]
     ]
@@ -168,15 +169,15 @@ def needless_actions(episode: Episode) -> int:
 
 
 def actions_after_failed_grasp(episode: Episode) -> int:
-    """The number of actions after the episode's first missed or lost grasp. In these actions a
-    policy with a memory of failed grasps may decide differently."""
+    """The number of actions after the episode's first failed grasp. In these actions a policy with
+    a memory of failed grasps may decide differently."""
     outcomes = [action["outcome"] for action in episode["actions_taken"]]
     failed = [index for index, outcome in enumerate(outcomes) if outcome in _FAILED_GRASPS]
     return len(outcomes) - 1 - failed[0] if failed else 0
 
 
 def counted_objects(episodes: Sequence[Episode]) -> list[list[Entry]]:
-    """The objects of each episode that count, which are those for which a goal was left.
+    """The objects of each episode that count: those for which a goal was left.
 
     In a failed or timed-out episode no object is a success or has errors. If the episode's process
     died, the names of its objects may be unknown. For each category, such an episode gets as many

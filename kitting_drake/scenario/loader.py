@@ -112,8 +112,8 @@ def _onto(raw: dict, defaults: Scenario) -> tuple[dict, Scenario]:
 def _without_mappings(given: dict, current: Task) -> Task:
     """Returns the task over which `given` is merged.
 
-    If `given` selects another type of task, it is the default task of that type. The mappings that
-    `given` replaces are empty in it.
+    This is `current`. If `given` selects another type of task, it is the default task of that type,
+    with empty mappings in place of those that `given` replaces.
     """
     for variant in typing.get_args(Task):
         if variant is PythonTask:

@@ -57,8 +57,7 @@ _OVERLAYS: dict[str, tuple[dict[str, Any], ...]] = {
     "distractors": tuple({"task": {"distractors": count}} for count in (2, 4, 8)),
 }
 _WORSE_IF_LESS = ("steepest_deg",)
-"""Fields of which lower values are less perfect. For all other fields, higher values are less
-perfect."""
+"""Fields whose lower values are stronger perturbations. For all other fields, higher values are."""
 
 NAMES = (*_OVERLAYS, "all")
 
@@ -71,7 +70,7 @@ def perturbation(text: str, scenario: Scenario) -> dict[str, Any]:
     Args:
         text: `NAME[:LEVEL],...`. The default level is `moderate`. `all` means all perturbations
             that apply to the scenario's task.
-        scenario: the scenario to perturb. Its values are kept where they are already less perfect.
+        scenario: the scenario to perturb. Its own values are kept where they perturb more.
 
     Raises:
         UserError: a name or level is unknown, a name is given twice, or a perturbation does not
@@ -111,7 +110,7 @@ def _applies(name: str, scenario: Scenario) -> bool:
 
 
 def _keep_worse(overlay: dict[str, Any], found: object) -> None:
-    """Replaces each number in `overlay` by the scenario's own number where this is less perfect."""
+    """Replaces each number in `overlay` by the scenario's own number where that perturbs more."""
     for name, value in overlay.items():
         given = getattr(found, name)
         if isinstance(value, dict) and dc.is_dataclass(given):

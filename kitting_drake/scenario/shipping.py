@@ -101,8 +101,8 @@ def _own_modules(modules: Iterable[str]) -> list[Path]:
             continue
         # A package without an `__init__.py` may have several folders.
         places = [Path(place) for place in spec.submodule_search_locations or [spec.origin or ""]]
-        # Packages that are installed here must be installed on the node as well, so they are not
-        # packed.
+        # Packages that are installed here must be installed on the cluster as well, so they are
+        # not packed.
         installed = sysconfig.get_path("purelib")
         found += [path for path in places if path.exists() and not path.is_relative_to(installed)]
     return found
@@ -111,7 +111,7 @@ def _own_modules(modules: Iterable[str]) -> list[Path]:
 def _relative(value: Any, base: Path, places: set[Path]) -> Any:
     """Copies a value and makes every path to one of `places` relative to `base`.
 
-    Absolute paths would not be valid on the node.
+    Absolute paths would not be valid on other machines.
     """
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = {

@@ -62,7 +62,7 @@ def judge(action: PickPlaceAction, loose: Sequence[LooseTool], planner: PickPlac
 
 
 def covering(action: PickPlaceAction, loose: Sequence[LooseTool]) -> list[PlanarPose]:
-    """Returns picks that cover the tool of an action.
+    """Returns poses all over the tool that an action picks.
 
     A policy that gets them as failed picks takes another tool next.
     """
@@ -101,7 +101,7 @@ def _is_grasp(action: PickPlaceAction, picked: LooseTool, planner: PickPlacePara
 
 
 def _tip_height(pick: PlanarPose, picked: LooseTool, planner: PickPlaceParameters) -> float:
-    """The height of the fingertips at a pick, in metres above the table."""
+    """Returns the height of the fingertips at a pick, in metres above the table."""
     between = rectangle_at((PAD_LENGTH, MAX_OPENING), pick.x, pick.y, pick.theta)
     held = _world_solid(picked.tool, picked.X_WT) ^ between.extrude(2 * _TALL).translate(
         (0, 0, -_TALL)

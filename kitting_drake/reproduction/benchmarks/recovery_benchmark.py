@@ -200,12 +200,19 @@ _Strip = tuple[str, Sequence[StripFrame], Sequence[str]]
 
 @dataclass
 class _Count:
+    """Sums over all episodes with one disturbance."""
+
     recovered: int = 0
+    """The number of disturbed objects that were in their cavities in the end."""
     disturbed: int = 0
+    """The number of episodes with a disturbed object."""
     kitted: int = 0
     objects: int = 0
     touched: int = 0
+    """The number of `seated` objects that were picked again, or were not in their cavities in the
+    end."""
     seated: int = 0
+    """The number of objects that were in their cavities when an action began."""
     actions: int = 0
     failed: int = 0
     """The number of failed episodes. All of their objects count as not placed."""

@@ -52,8 +52,8 @@ def ask_mujoco(
 ) -> dict[str, Any]:
     """Releases tools in MuJoCo at the poses at which oracles release them in Drake.
 
-    The tools are from unseen toolsets. The MuJoCo scene has no hand, only the table, the kit and
-    the tool at rest.
+    The tools are from unseen toolsets. The MuJoCo scene has only the table, the kit and the tool,
+    which starts at rest.
 
     Args:
         placements: the number of releases to compare.

@@ -86,6 +86,7 @@ class PlacedTool:
     outline: CrossSection
     """The outline in the sheet's frame, in mm."""
     height: float
+    """The height of the prism, in mm."""
     paints: tuple[str, str] = ("steel", "red")
     """The paints of the tool's two ends, keys of `PAINTS`."""
 
@@ -99,6 +100,7 @@ class PlacedPrint:
     low: tuple[float, float]
     """The lower left corner (x, y) in the sheet's frame, in mm."""
     size: tuple[float, float]
+    """The size along x and y, in mm."""
 
 
 @dataclass(frozen=True)

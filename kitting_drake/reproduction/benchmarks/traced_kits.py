@@ -75,7 +75,7 @@ def _measure(number: int, seed: int, clearance_mm: float, folder: Path) -> dict[
     names = [name for name, place in traced.items() if place is not None]
     cavities = [str(place.resolve()) for place in traced.values() if place is not None]
     if not names:
-        raise UserError("all photos of all tools are in doubt: take another --seed")
+        raise UserError("all photos of a kit's tools are refused or in doubt: take another --seed")
     export_kit(KitRequest(tuple(cavities), folder / "kit", clearance_mm=clearance_mm))
     task = json.dumps({"tools": names, "cavities": cavities, "tries": 1})
     chosen = find_scenario(
@@ -89,7 +89,7 @@ def _measure(number: int, seed: int, clearance_mm: float, folder: Path) -> dict[
 
 
 def _names(number: int, seed: int) -> list[str]:
-    """The tools of a kit. All tools are used once before one is used again."""
+    """Returns the tools of a kit. All tools are used once before one is used again."""
     round_, place = divmod(_TOOLS * number, len(TOOLS))
     mixed = np.random.default_rng([seed, round_]).permutation(len(TOOLS))
     return [TOOLS[index] for index in mixed[place : place + _TOOLS]]

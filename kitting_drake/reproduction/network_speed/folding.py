@@ -25,7 +25,7 @@ MEASURES = ("training_step", "alpha_training_step", "decision", "alpha_inference
 
 
 def measure_folding(setup: SpeedSetup) -> dict[str, Any]:
-    """Times the SO(2) networks both as built from escnn's modules and as this package runs them.
+    """Times the SO(2) networks, as built from escnn's modules and as this package runs them.
 
     All variants have the same weights and compute the same function, up to rounding.
 

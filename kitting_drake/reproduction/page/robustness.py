@@ -196,7 +196,7 @@ def _strict(run: Run) -> tuple[int, int]:
 
 
 def with_figures(page: str, figures: str) -> str:
-    """Replaces the text between the two marks of a page.
+    """Returns a page with `figures` as the text between its two marks.
 
     Raises:
         UserError: the page lacks the marks.
@@ -205,7 +205,7 @@ def with_figures(page: str, figures: str) -> str:
     _, end, tail = rest.partition(_END)
     if not begin or not end:
         raise UserError(
-            f"the page on robustness lacks the marks {_BEGIN.strip()} and {_END.strip()}"
+            f"robustness.md lacks the marks {_BEGIN.strip()} and {_END.strip()}: restore them"
         )
     return f"{head}{begin}{figures}{end}{tail}"
 

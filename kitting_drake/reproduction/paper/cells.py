@@ -228,6 +228,7 @@ class Cell:
     continuous: bool = False
     """Whether actions are refined beyond pixels and bins; the paper quantizes them."""
     fit_outlines: bool = False
+    """Whether actions are refined by outlines, as in `Learned`. In the paper they are not."""
     search: bool = False
     """Whether the hand searches when an insertion is blocked. In the paper it does not."""
     end_at_success: bool = False

@@ -47,7 +47,7 @@ _NOT_MEASURED = (
         "0.001 for ours, the best of three for others",
     ),
 )
-"""Rows on the differences: the name, how it is in the paper or in Ravens, and how it is here."""
+"""The differences whose effect was not measured: name, the paper's or Ravens' way, and ours."""
 
 
 def departures(results: Mapping[str, Result]) -> str:
@@ -131,8 +131,8 @@ def _earlier_hand(results: Mapping[str, Result]) -> str:
 
 
 def _memory(results: Mapping[str, Result]) -> str:
-    """Writes by kind of task how many actions the memory of failed grasps can have changed, in
-    percent."""
+    """Writes, for kitting and for Ravens tasks, the percentage of the actions that the memory of
+    failed grasps can have changed."""
     parts = []
     for label, is_kitting in (("kitting", True), ("Ravens", False)):
         found = [

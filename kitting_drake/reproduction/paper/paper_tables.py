@@ -28,8 +28,8 @@ STEADIER = {
     ("palletizing_boxes", "equivariant_transporter", 10): 1e-3,
     ("palletizing_boxes", "equivariant_transporter", 1): 1e-3,
 }
-"""Learning rates by task, method and number of demonstrations, for trainings that diverge at the
-best rate of their `reference`. They use its second-best rate. With ten demonstrations, the
+"""Learning rates, by task, method and number of demonstrations, of trainings that diverge at the
+best rate of their `reference`. Each is the second-best rate there. With ten demonstrations, the
 pick-angle loss diverged."""
 MATCHED = "matched"
 """The preset in which a baseline has the same share of its original's parameters as the SO(2)

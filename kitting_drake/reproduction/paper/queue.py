@@ -291,7 +291,7 @@ def _check_training(training: Training, folder: Path) -> None:
 
 
 def _end(process: subprocess.Popen[str]) -> None:
-    """Terminates a command, which may first save its state."""
+    """Terminates a command, after giving it time to save its state."""
     if process.poll() is None:
         process.terminate()
         try:
@@ -302,7 +302,7 @@ def _end(process: subprocess.Popen[str]) -> None:
 
 
 def run_paper(queue: Queue, cells: Sequence[Cell]) -> dict[str, str]:
-    """Fills cells with `Queue.run`. If it is stopped, it also stops its child process.
+    """Fills cells with `Queue.run`. If a signal stops it, the running command ends too.
 
     Returns:
         The reason for each cell that could not be filled, by name.
@@ -310,7 +310,7 @@ def run_paper(queue: Queue, cells: Sequence[Cell]) -> dict[str, str]:
     Raises:
         UserError: a result does not fit its cell.
     """
-    # Terminate the child, because it would otherwise lock its folder against the next queue.
+    # Terminate the command, which would otherwise lock its folder against the next queue.
     ended_by = (signal.SIGTERM, signal.SIGHUP)
     before = [signal.signal(number, lambda came, _: sys.exit(128 + came)) for number in ended_by]
     try:

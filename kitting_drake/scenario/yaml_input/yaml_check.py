@@ -48,7 +48,7 @@ def check_yaml(schema: Any, value: Any, where: str) -> None:
         if isinstance(value, dict) and "_tag" in value:
             tag = str(value["_tag"]).lstrip("!")
             raise ValueError(
-                f"{where or 'the scenario'} has the tag !{tag}, but this field takes no tag"
+                f"{where or 'the scenario'} has the tag !{tag}, but takes no tag: remove it"
             )
         _check_dataclass(schema, value, where)
     else:
