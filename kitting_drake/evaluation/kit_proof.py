@@ -249,7 +249,7 @@ def _prove(
 
 
 def _drawn_kit(seed: int, clearance_mm: float, clearance_of: Mapping[str, float]) -> dict[str, Any]:
-    """The clearances of an episode, as fields of a scenario's `kit`."""
+    """Draws the clearances of an episode, as fields of a scenario's `kit`."""
     error = float(np.random.default_rng([seed, 23]).normal(0.0, TOLERANCE_MM))
     drawn = {
         name: round(max(value + 1e-3 * error, 0.0), 6)

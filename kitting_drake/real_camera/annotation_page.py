@@ -45,8 +45,8 @@ _HOST = "127.0.0.1"
 _LONGEST = 100_000
 """The largest size of an action in JSON, in bytes."""
 _LEAST_RANGE = 0.02
-"""The height that is drawn white is at least this, in metres, so that the noise of an empty table
-stays dark."""
+"""The least height that may be drawn white, in metres, so that the noise of an empty table stays
+dark."""
 _UNSEEN = np.array([60, 0, 90], np.uint8)
 """The colour (RGB) of pixels that no camera sees."""
 
@@ -123,7 +123,8 @@ class AnnotationServer(ThreadingHTTPServer):
         """Writes the action of a step.
 
         Raises:
-            UserError: the action is invalid or cannot be written. An existing file is then kept.
+            UserError: the action is invalid. An existing file is then kept.
+            MachineError: the file cannot be written. An existing file is then kept.
         """
         step = self.steps[index]
         action = dataclasses.replace(
@@ -219,7 +220,10 @@ def draw_color(observation: Observation) -> bytes:
 
 
 def draw_height(observation: Observation) -> bytes:
-    """Draws the heights of o_t as a PNG of (rows, cols): black is the table, white the highest."""
+    """Draws the heights of o_t as a PNG of (rows, cols).
+
+    Black is the table. White is the 99.5th percentile of the heights, but at least `_LEAST_RANGE`.
+    """
     height = observation.height
     top = max(float(np.percentile(height, 99.5)), _LEAST_RANGE)
     grey = np.rint(255 * np.clip(height / top, 0, 1)).astype(np.uint8)

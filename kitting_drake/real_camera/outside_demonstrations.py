@@ -174,7 +174,8 @@ def convert(folder: Path, calibration: Calibration, learning: Learning, path: Pa
 
     Raises:
         UserError: a step has no action or an invalid action, frames are unusable, two
-            demonstrations are the same, or the file cannot be written. The message names the step.
+            demonstrations are the same, or the file cannot be written. The message names the step,
+            the demonstrations or the file.
     """
     labelled = [_labelled(steps, calibration) for steps in find_demonstrations(folder)]
     actions = [[action.as_dict() for _, action in steps] for steps in labelled]

@@ -124,6 +124,6 @@ def write_action(step: Path, action: StepAction) -> None:
     """Writes the action of a step atomically. An existing file is replaced.
 
     Raises:
-        UserError: the file cannot be written.
+        MachineError: the file cannot be written.
     """
     write_json(step / NAME, action.as_dict())

@@ -130,7 +130,8 @@ def check_camera(camera: Camera) -> None:
 
 
 def camera_pose(camera: Camera) -> RigidTransform:
-    """X_WB of a camera; z is the viewing direction, x points right in the image, y down."""
+    """The pose X_WB of a camera in the world; z is the viewing direction, x points right in the
+    image, y down."""
     return RigidTransform(_config(camera).X_PB.GetDeterministicValue())
 
 

@@ -402,7 +402,7 @@ def write_calibration(path: Path, calibration: Calibration) -> None:
     """Writes a calibration in this project's own layout, without rounding.
 
     Raises:
-        UserError: the file cannot be written.
+        MachineError: the file cannot be written.
     """
     content = calibration_record(calibration)
     write_atomically(path, yaml.safe_dump(content, sort_keys=False, default_flow_style=None))

@@ -50,12 +50,12 @@ class Intrinsics:
 
 
 def has_intrinsics(node: dict[str, Any]) -> bool:
-    """Whether a mapping holds intrinsics in one of the three layouts."""
+    """Whether a mapping holds intrinsics in the layout of OpenCV, of ROS, or our own."""
     return any(key in node for key in ("fx", *_MATRICES))
 
 
 def read_intrinsics(node: dict[str, Any], where: str) -> Intrinsics:
-    """Reads the intrinsics in a mapping, in any of the three layouts.
+    """Reads the intrinsics in a mapping, in the layout of OpenCV, of ROS, or our own.
 
     Raises:
         UserError: a field is missing or invalid. The message names the field.

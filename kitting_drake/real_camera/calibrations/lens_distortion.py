@@ -92,8 +92,7 @@ def distort(x: Array, y: Array, model: str, values: tuple[float, ...]) -> tuple[
 def undistort(
     u: Array, v: Array, model: str, values: tuple[float, ...], name: str
 ) -> tuple[Array, Array]:
-    """Returns x and y of the undistorted rays (x, y, 1) that a lens images at the points (u, v), at
-    depth 1.
+    """Returns x and y of the undistorted rays (x, y, 1) whose distorted rays are (u, v, 1).
 
     Raises:
         UserError: the distortion cannot be inverted at some point. The message names the camera.

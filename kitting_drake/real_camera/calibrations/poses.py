@@ -43,8 +43,9 @@ def has_pose(node: dict[str, Any]) -> bool:
 
 
 def read_pose(node: dict[str, Any], where: str, folder: Path) -> Array:
-    """Returns the pose (4, 4) of the camera's optical frame in the base frame, in any of the
-    layouts.
+    """Returns the pose (4, 4) of the camera's optical frame in the base frame.
+
+    `docs/bench.md` describes the layouts of poses.
 
     Args:
         node: the camera's entry.

@@ -92,7 +92,7 @@ class Check:
 def check_cameras(
     frames: Mapping[str, Frame], calibration: Calibration, block: Block | None = None
 ) -> Check:
-    """Checks cameras by the table, which should be level and at its height in the base frame.
+    """Checks cameras by the table, which they should see level and at its height in the base frame.
 
     Each camera's pose is corrected by a rotation that makes the table level, and then by a vertical
     shift. With a block, the cameras are also shifted horizontally and rotated about the vertical,

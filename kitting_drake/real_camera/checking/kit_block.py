@@ -61,7 +61,7 @@ class SeenBlock:
 def see_block(
     points: Array, camera: BenchCamera, X_BC: Array, block: Block, table: float, noise: float
 ) -> SeenBlock:
-    """Measures the block in a camera's image.
+    """Measures a block of known size in a camera's image.
 
     Depth serves only to select the pixels of the block's top. Their rays are intersected with the
     plane of the top, and each pixel covers an area on it. The moments of these areas give the

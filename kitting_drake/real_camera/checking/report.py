@@ -61,7 +61,7 @@ def save_check(folder: Path, check: Check) -> None:
     """Writes `check.json`, the corrected calibration `corrected.yaml`, and `check.png`.
 
     Raises:
-        UserError: a file cannot be written.
+        MachineError: a file cannot be written.
     """
     # Import matplotlib lazily.
     from kitting_drake.evaluation.check_figure import draw_heights
@@ -134,7 +134,7 @@ def save_found(folder: Path, found: FoundTable, observation: Observation) -> Non
         observation: the heightmap over the grid `found.around`.
 
     Raises:
-        UserError: a file cannot be written.
+        MachineError: a file cannot be written.
     """
     # Import matplotlib lazily.
     from kitting_drake.evaluation.found_figure import draw_found

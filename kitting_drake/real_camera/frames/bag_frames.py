@@ -39,7 +39,7 @@ _UNITS = "std_msgs/msg/Float32"
 
 
 def read_bag_frames(path: Path, calibration: Calibration, time: float | None) -> dict[str, Images]:
-    """Returns colour and depth of each camera from the same recording, by camera name.
+    """Returns colour and depth of each camera in a recording, by camera name.
 
     Args:
         path: the recording's path.

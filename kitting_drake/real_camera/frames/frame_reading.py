@@ -231,7 +231,10 @@ def _find(folders: Sequence[Path], name: str, alone: bool) -> _Sources:
 
 
 def _only(existing: Sequence[Path], folders: Sequence[Path], name: str, number: int) -> Path:
-    """Returns the only file found; `number` is 0 for colour and 1 for depth."""
+    """Returns the only existing file of a camera; raises UserError if there is none or another.
+
+    For the message, `number` is 0 for colour and 1 for depth.
+    """
     if len(existing) != 1:
         word, ending = (("color", ".png"), ("depth", ".npy"))[number]
         reason = (

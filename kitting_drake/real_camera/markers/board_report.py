@@ -26,7 +26,7 @@ _AXES = ((230, 40, 40), (40, 180, 40), (60, 90, 255))
 
 
 def clear_earlier(folder: Path, source: Path) -> Path:
-    """Removes the files of an earlier run, so that nobody uses them after a failure.
+    """Removes the calibration of an earlier run, so that nobody uses it if this run fails.
 
     Args:
         folder: the folder of the files.
@@ -38,6 +38,7 @@ def clear_earlier(folder: Path, source: Path) -> Path:
     Raises:
         UserError: this path is the file of the intrinsics, or holds a file that is not from an
             earlier run.
+        MachineError: a file cannot be removed.
     """
     path, record = folder / "calibration.yaml", folder / "calibrate.json"
     if path.resolve() == source.resolve():
@@ -57,7 +58,7 @@ def save_calibrated(path: Path, calibrated: Calibrated) -> None:
     it.
 
     Raises:
-        UserError: a file cannot be written.
+        MachineError: a file cannot be written.
     """
     cameras = {camera.name: camera for camera in calibrated.calibration.cameras}
     for result in calibrated.cameras:
@@ -68,7 +69,7 @@ def save_calibrated(path: Path, calibrated: Calibrated) -> None:
 
 
 def print_calibrated(console: Console, calibrated: Calibrated) -> None:
-    """Prints a line for each camera."""
+    """Prints a line for each camera, and the height and tilt of the table."""
     table = Table()
     for title in ("camera", "images", "corners", "error px", "", "view deg", "focal ratio"):
         table.add_column(title, justify="left" if title in ("camera", "") else "right")

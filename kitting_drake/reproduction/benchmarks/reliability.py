@@ -242,7 +242,10 @@ def _draw_noise(rng: np.random.Generator) -> SensorNoiseParameters:
 
 
 def fit(judged: list[Judged]) -> Reliability:
-    """Fits the regression of one policy. The threshold is `LEAST_CONFIDENCE`."""
+    """Fits a logistic regression of the right decisions of one policy on their evidence.
+
+    The threshold is `LEAST_CONFIDENCE`.
+    """
     acted = [item for item in judged if item.verdict != "stop"]
     names = sorted(acted[0].evidence)
     facts = np.array([[item.evidence[name] for name in names] for item in acted])

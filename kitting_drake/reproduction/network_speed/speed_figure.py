@@ -50,7 +50,7 @@ def draw_networks(measured: dict[str, Any], path: Path) -> None:
         path: a .png file to write.
 
     Raises:
-        UserError: the file cannot be written.
+        MachineError: the file cannot be written.
     """
     # Import matplotlib lazily.
     import matplotlib

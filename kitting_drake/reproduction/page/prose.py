@@ -8,7 +8,7 @@ _PART = re.compile(r"<!-- part: (\w+) -->\n")
 
 
 def prose(part: str, **values: object) -> str:
-    """Returns a part of the prose, with a final newline.
+    """Returns a part of `prose.md` with its placeholders filled in, and a final newline.
 
     Args:
         part: the name of the part.

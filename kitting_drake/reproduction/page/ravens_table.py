@@ -44,14 +44,14 @@ PAPER: dict[tuple[str, int], tuple[tuple[float, float, float], ...]] = {
 
 
 def in_ravens_table(run: Run) -> bool:
-    """Whether a run is of one of the five tasks in its default form, with refined actions."""
+    """Whether a run is of one of the five Ravens tasks by default, with refined actions."""
     if run.summary["task"] not in TASKS or run.departures:
         return False
     return run.method not in LEARNED or bool(run.detail("continuous"))
 
 
 def ravens_section(runs: Sequence[Run]) -> list[str]:
-    """Writes the section on the five tasks; it is empty without runs of them.
+    """Writes the section on the five Ravens tasks; it is empty without runs of them.
 
     Args:
         runs: all runs; those that are not `in_ravens_table` are ignored.

@@ -215,7 +215,7 @@ def rates_key(chosen_by: Training) -> str:
 
 @dataclass(frozen=True)
 class Cell:
-    """An evaluation of a policy on a task."""
+    """A cell of the paper's tables, or of our own: the evaluation of a policy on a task."""
 
     task: str
     policy: Training | str

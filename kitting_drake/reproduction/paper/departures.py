@@ -51,7 +51,7 @@ _NOT_MEASURED = (
 
 
 def departures(results: Mapping[str, Result]) -> str:
-    """Writes the section, with its two tables.
+    """Writes the section on departures from the paper, with its two tables.
 
     Args:
         results: the results by the names of their cells.

@@ -29,7 +29,7 @@ from kitting_drake.reproduction.paper.paper_tables import (
 
 
 def differences(results: Mapping[str, Result]) -> list[str]:
-    """Writes the section; it is empty if no two cells can be compared."""
+    """Writes the section on paired differences; it is empty if no two cells can be compared."""
     rows = []
     for name, result in results.items():
         for label, other in _rivals(result.cell):

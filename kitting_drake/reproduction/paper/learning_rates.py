@@ -43,7 +43,7 @@ def write_rates(folder: Path, rates: Rates) -> None:
     """Writes the file of `read_rates`.
 
     Raises:
-        UserError: the file cannot be written.
+        MachineError: the file cannot be written.
     """
     content = {
         key: {rate: cost if math.isfinite(cost) else None for rate, cost in costs.items()}

@@ -68,7 +68,7 @@ class Queue:
     again."""
 
     def run(self, cells: Sequence[Cell]) -> dict[str, str]:
-        """Fills cells in order.
+        """Trains and evaluates cells in order, and adds their results to the table of runs.
 
         Returns:
             The reason for each cell that could not be filled, by name.
