@@ -161,7 +161,7 @@ def _check_pose(camera: BenchCamera, grid: PixelGrid) -> None:
         x, y, _ = X_BC[:3, 3] + X_BC[:3, 2] * (grid.z_min - X_BC[2, 3]) / X_BC[2, 2]
         hint = f"it looks at ({x:.2f}, {y:.2f}) m on the table"
     raise CalibrationError(
-        f"camera {camera.name}, at its calibrated pose, sees nothing of the workspace "
+        f"at its calibrated pose, camera {camera.name} sees nothing of the workspace "
         f"({grid.x_min:g} to {grid.x_max:g}, {grid.y_min:g} to {grid.y_max:g} m): {hint}"
     )
 
