@@ -191,11 +191,11 @@ class Learned(PolicyConfig):
     # Whether to avoid picks within 10 mm of a failed grasp. The paper's policy has no such memory.
     avoid_failed_picks: bool = True
 
-    # Whether to recover from failed insertions and to take heaps apart. The policy first presses
-    # down protruding objects, then picks objects that fit into a recess, then lays objects that lie
-    # on others on the table, and at last takes out objects that could not be pressed down, to try
-    # them again. An object that was taken out once is not taken out again. Recovery needs extra
-    # actions: see the task's `tries`.
+    # Whether to correct failed insertions, take heaps apart and turn objects over. The policy first
+    # presses down protruding objects. Then it picks objects that fit into a recess. When none is
+    # left, it lays objects that lie on others on the table, takes out objects that could not be
+    # pressed down, and turns over objects that lie upside down, in this order. No object is taken
+    # out twice. Recovery needs extra actions: see the task's `tries`.
     recover: bool = False
 
     def make_system(self, site: PolicySite) -> LeafSystem:
