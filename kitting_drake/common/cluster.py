@@ -178,7 +178,7 @@ def _answer(versions_wanted: dict[str, str], call: bytes) -> bytes:
     try:
         found = versions()
         if found != versions_wanted:
-            # Compare all packages of the node and of this machine: only one may have a package.
+            # Compare the packages of both machines, because one machine may lack a package.
             names = (*versions_wanted, *found)
             name = next(key for key in names if found.get(key) != versions_wanted.get(key))
             there, here = (which.get(name, "none") for which in (found, versions_wanted))

@@ -154,9 +154,9 @@ def look_at(position: Sequence[float], target: Sequence[float]) -> RigidTransfor
 
 
 X_WOVERVIEW = look_at([1.62, -0.95, 1.13], [0.48, -0.02, 0.06])
-"""Camera pose for pictures and videos of the whole cell with a floating hand. `X_WARM_OVERVIEW` is
-that for an arm."""
+"""Camera pose for pictures and videos of the whole cell with a floating hand."""
 X_WARM_OVERVIEW = look_at([2.05, -1.35, 1.25], [0.36, 0.0, 0.34])
+"""Camera pose for pictures and videos of the whole cell with an arm."""
 
 
 def picture_camera(

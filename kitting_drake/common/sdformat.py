@@ -20,11 +20,11 @@ def model_text(path: Path, *, friction: float = 1.0, mass: float = 1.0) -> str |
         mass: factor of all masses and moments of inertia.
 
     Returns:
-        The text; None if the unscaled model must be loaded from its file, because it is not
-        SDFormat or refers to other files than meshes.
+        The text. None if the caller must load the file itself: both factors are 1, and the file is
+        not valid SDFormat or refers to files other than meshes.
 
     Raises:
-        UserError: the file is not valid SDFormat.
+        UserError: a factor is not 1, and the file is not valid SDFormat.
     """
     is_varied = friction != 1 or mass != 1
     if not is_varied and path.suffix != ".sdf":

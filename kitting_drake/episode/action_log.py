@@ -151,8 +151,8 @@ class ActionLog:
 def _place_errors(
     item: PlacedObject, goal: Goal, X_WGoal: RigidTransform, arrival: RigidTransform
 ) -> tuple[float, float, float]:
-    """Returns the mean displacement (m), the distance of the middles (m) and the angle (rad)
-    between an object's pose after the action and its goal.
+    """Returns how an object's pose after the action differs from its goal pose: the mean
+    displacement (m), the distance of the object's middle from its goal (m), and the angle (rad).
 
     Only the planar arrival pose is known, so heights are not compared.
     """

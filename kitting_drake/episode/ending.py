@@ -114,7 +114,7 @@ def _loose_and_free(station: KittingStation, root_context: Context) -> tuple[lis
         zip(placements, station.object_poses(root_context), strict=True)
     ):
         distance = math.hypot(*X_WB.translation())
-        # This form is also false for NaN.
+        # The comparison is also false if the distance is NaN.
         if not item.success and distance < GONE:
             loose.append(index)
     return loose, [index for index in range(len(station.scene.goals)) if index not in filled]

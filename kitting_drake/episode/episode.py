@@ -43,8 +43,8 @@ class ObjectResult:
     cause: str | None
     """Why the object failed, one of the task's `causes`; None for a success."""
     measures: dict[str, bool] = dataclasses.field(default_factory=dict)
-    """Whether the object is a success by each of the scene's further `measures`, and, as `strict`,
-    by `strict_success`; empty if the scene has no further measures."""
+    """For each of the scene's further `measures`, whether it counts the object as a success. The
+    key `strict` holds `strict_success`. Empty if the scene has no further measures."""
 
 
 @dataclasses.dataclass

@@ -55,8 +55,8 @@ class JointView:
         return np.array([*state[:j], sum(state[j : j + FINGERS])], np.float32)
 
     def command(self, root_context: Context) -> NDArray[np.float32]:
-        """(entries) the planner's present targets, in rad and m. The opening accounts for the
-        closing force: it is smaller than the planner's, so that the fingers' springs alone pull
+        """(entries) the planner's present targets, in rad and m. If the planner applies a closing
+        force, the opening is smaller than the planner's, so that the fingers' springs alone pull
         with the same force."""
         joints = self._port(root_context, "commanded")[: self._joints]
         opening = self._port(root_context, "commanded_opening")[0]

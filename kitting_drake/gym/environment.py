@@ -100,7 +100,7 @@ class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Makes a new scene, as Gymnasium and the docstring of the class describe.
+        """Makes a new scene; returns its observation and `info` (see the docstring of the class).
 
         Raises:
             ValueError: the seed is invalid.
@@ -190,7 +190,7 @@ class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         return render_picture(scene_graph, context, self._station.X_WOverview)
 
     def close(self) -> None:
-        """Frees the simulation. Drake 1.51 (for Python 3.11) still keeps about 35 MB in memory."""
+        """Frees the simulation. Drake 1.51 (for Python 3.11) keeps about 35 MB of it in memory."""
         self._station = self._episode = None
         # A Diagram and its systems form reference cycles, which only the garbage collector frees.
         gc.collect()

@@ -46,7 +46,7 @@ class JointEnvironment(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32
     - Names and values are those of `collect --export lerobot`: see `policies.data.frames`.
     - Observation: `observation.state`, and `observation.images.CAMERA` of each camera.
     - Action: a target for each of `names`, in m and rad, to be reached after 1 / `fps` seconds.
-      Commands move to it in a straight line, no faster than the joints' velocity limits.
+      Commands move to the targets in a straight line, within the joints' velocity limits.
     - Reward: the increase of the task's reward. The sum of all rewards is 1 when every goal is
       filled.
     - Terminated: every goal is filled, and all objects are released and at rest. Truncated: the

@@ -29,13 +29,11 @@ if TYPE_CHECKING:
 FILE = MODELS / "policies" / "confidence.json"
 """The file of the fitted regressions, one for each kind of policy."""
 _SAME_PICK = 0.010
-"""Predicted probability within this distance of the pick, in metres, supports the pick."""
+"""Pixels within this distance of the pick, in metres, count as the same pick."""
 _OTHER_PICKS = 0.060
-"""Predicted probability within this distance of the pick, in metres, is taken to belong to the same
-object."""
+"""Pixels within this distance of the pick, in metres, count as picks of the same object."""
 _SAME_ANGLE = math.radians(10)
-"""Predicted probability within this angle of the chosen pick angle, in radians, supports that
-angle."""
+"""Angles that differ from the chosen pick angle by at most this, in radians, count as the same."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +77,7 @@ def _read(path: Path, policy: str) -> Reliability:
 
 
 def evidence_of_networks(observation: Observation, decision: Decision) -> Evidence:
-    """Returns the facts about a decision of the networks, which must not be a stop."""
+    """Returns the facts about a decision of the networks. The decision must not be a stop."""
     parts = certainty(decision, observation.grid.resolution)
     return {
         "something_to_pick": float(np.clip(decision.log_odds or 0.0, -8, 8)),

@@ -156,7 +156,7 @@ class Draft:
     """(row, col) of the place at which the outlines of object and recess fit; None if they do not
     fit."""
     belongs: bool = False
-    """Whether the outlines show that the object fits into the recess at its place."""
+    """Whether the outlines show that the object fits into the recess at the place."""
     stop: bool = False
     """Whether the policy stops: nothing is left to pick, or nothing is seen well enough."""
     reason: str = ""

@@ -47,7 +47,7 @@ class Decision:
     log_odds: float | None = None
     """The log-odds that there is something to pick; None if the networks do not predict it."""
     belongs: bool = False
-    """Whether the outlines show that the object fits into the recess at its place."""
+    """Whether the outlines show that the object fits into the recess at the place."""
     moved_pick: float = 0.0
     """How far the stages moved the pick from the networks' proposal, in mm; at most 40."""
     moved_place: float = 0.0
@@ -116,8 +116,8 @@ class LearnedPolicy:
     def act(
         self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()
     ) -> tuple[PickPlaceAction, Decision | None]:
-        """Returns the action and its decision. The decision is None for an action of the stage
-        `Recovery`.
+        """Returns the action, and the decision that led to it. The decision is None for an action
+        of the stage `Recovery`.
 
         The arguments are those of `__call__`.
         """
@@ -134,8 +134,8 @@ class LearnedPolicy:
         return decision.action, decision
 
     def decide(self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()) -> Decision:
-        """Returns the networks' action and its distributions, even if the stage `Recovery` would
-        replace the action.
+        """Returns the decision of the networks, even if the stage `Recovery` would replace its
+        action.
 
         The arguments are those of `__call__`.
         """

@@ -24,8 +24,8 @@ from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import wrap_to_pi
 
 _AS_GOOD = 2.0
-"""A rotation counts as equally good as the best one if its score is at most this many nats lower
-and its place is within `_SAME_PLACE`."""
+"""A rotation counts as equally good as the best one if its score is at most this many nats lower,
+and its place is within `_SAME_PLACE` of the best one's."""
 _SAME_PLACE = 4.0
 """The largest distance, in pixels, between the places of rotations that count as equally good."""
 _TRIES = 4

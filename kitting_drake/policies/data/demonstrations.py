@@ -169,8 +169,8 @@ def merge_demonstrations(
 
 
 def _copy(part: h5py.File, name: str, file: h5py.File, path: Path) -> None:
-    """Copies a group. Its error names both files, because HDF5 does not say whether reading or
-    writing failed."""
+    """Copies a group. The error message names both files, because HDF5 does not say whether reading
+    or writing failed."""
     try:
         part.copy(name, file)
     except (OSError, RuntimeError) as error:

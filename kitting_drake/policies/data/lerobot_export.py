@@ -237,8 +237,8 @@ def _check_alike(read: EpisodeFrames, first: EpisodeFrames, source: Path) -> Non
     if list(read.images) != list(first.images) or not len(read):
         raise UserError(
             f"{source}: it has {len(read)} frames from {_cameras_of(read)}, but the first episode "
-            f"has {len(first)} from {_cameras_of(first)}: export only episodes with frames and the "
-            "same settings"
+            f"has {len(first)} from {_cameras_of(first)}: export only episodes with at least one "
+            "frame and the same settings"
         )
 
 

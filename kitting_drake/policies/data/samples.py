@@ -35,8 +35,8 @@ def observed(image: Image, grid: PixelGrid) -> Observation:
     """Makes an observation from a recorded image.
 
     Args:
-        image: (4, rows, cols). If it is all black, its unseen pixels must have been filled in, and
-            all pixels count as seen.
+        image: (4, rows, cols). An all-black image has no colours, and its unseen pixels must have
+            been filled in. All of its pixels then count as seen.
         grid: the pixel grid of the image.
     """
     valid = None if image[:3].any() else np.ones(image.shape[1:], bool)
@@ -49,7 +49,7 @@ class ObservedScene:
 
     recorded: Pictured
     actions: tuple[PickPlaceAction, ...]
-    """The actions that the expert may take next. The action that it took comes first."""
+    """The actions that the expert may take next. The action that was taken comes first."""
     grid: PixelGrid
 
     @property

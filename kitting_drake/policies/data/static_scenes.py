@@ -199,14 +199,20 @@ def _check(heights: NDArray, actions: NDArray, first: NDArray, grid: PixelGrid) 
         )
     bounds = first.shape == (len(heights) + 1,) and first.dtype.kind in "iu"
     if not bounds or first[0] != 0 or first[-1] != len(actions) or (np.diff(first) < 0).any():
-        raise ValueError("its dataset `first` does not assign each action to one scene")
+        raise ValueError(
+            f"its dataset `first` must be {len(heights) + 1} integers that begin with 0, never "
+            f"decrease, and end with the number of actions, {len(actions)}"
+        )
 
 
 def _check_batches(ends: NDArray, count: int) -> None:
     """Raises ValueError unless `ends` divides the scenes into batches."""
     whole = ends.ndim == 1 and ends.dtype.kind in "iu" and len(ends) > 0
     if not whole or ends[-1] != count or (np.diff(ends) <= 0).any():
-        raise ValueError("its dataset `batch_ends` does not assign each scene to one batch")
+        raise ValueError(
+            "its dataset `batch_ends` must be increasing integers that end with the number of "
+            f"scenes, {count}"
+        )
 
 
 class StaticSamples(Sequence[LabelledImage]):

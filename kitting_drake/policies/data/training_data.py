@@ -88,8 +88,8 @@ class TrainingData:
 
     @property
     def unrelated(self) -> tuple[int, ...]:
-        """Where the data can be split into unrelated parts: for each possible split, the number of
-        items before it.
+        """The places at which the data can be split into two unrelated parts, each as the number of
+        items before the split.
 
         Static scenes share tools within a batch; demonstrations are independent.
         """

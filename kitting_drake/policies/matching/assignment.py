@@ -21,10 +21,11 @@ from kitting_drake.policies.matching.registration import (
 _WORST_COST = 0.0019
 """The largest mismatch, in metres, of an object and a recess into which it fits."""
 _GOOD = 0.0005
-"""An object whose mismatch with its recess is less than this, in metres, is not reversed."""
+"""An object whose mismatch with its recess is less than this, in metres, does not count as
+reversed."""
 _CLEARLY_BETTER = 0.75
-"""An object is reversed only if its mirror image's mismatch with the recess is less than this share
-of the object's own mismatch."""
+"""An object counts as reversed only if its mirror image's mismatch with the recess is less than
+this share of the object's own mismatch."""
 _PROMISING = 2.0
 """An object's outline is registered to a recess only if its `coarse_cost` there is at most this
 multiple of its least `coarse_cost` in any recess."""

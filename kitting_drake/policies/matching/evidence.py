@@ -109,7 +109,8 @@ def _fit_facts(
     rotation: float,
     place: Array,
 ) -> Evidence:
-    """Facts about the fit of an object to the recess under its place, zero if there is none."""
+    """Returns facts about the fit of a placed object to the recess under it; empty if there is
+    none."""
     overlaps = [int((item.mask & target).sum()) for item in segmentation.recesses]
     if not overlaps or not max(overlaps):
         return {}

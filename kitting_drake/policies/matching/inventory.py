@@ -19,11 +19,11 @@ moved."""
 _MOST_TRIES = 3
 """An object is tried at most this many times."""
 _LEAST_SHARE = 0.5
-"""The least area of a region that may contain an object for an open recess, as a share of the
-smallest open recess's area."""
+"""A region smaller than this share of the smallest open recess's area contains no object for an
+open recess."""
 _LARGEST_SHARE = 1.6
-"""The largest area of a region that may contain objects for the open recesses, as a multiple of the
-total area of these recesses."""
+"""A region larger than this multiple of the open recesses' total area does not consist of objects
+for these recesses."""
 
 
 @dataclass(frozen=True)

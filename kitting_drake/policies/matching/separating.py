@@ -180,7 +180,7 @@ def _free_pose(
             if free is None:
                 continue
             away = np.linalg.norm(free - pick, axis=1) * resolution
-            # A rotation of the wrist costs time as well.
+            # Besides the distance, count the rotation of the wrist, which also takes time.
             index = int(away.argmin())
             cost = float(away[index] + 0.05 * abs(angle))
             if best is None or cost < best[0]:

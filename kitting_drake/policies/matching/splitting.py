@@ -42,15 +42,15 @@ _RIM = 1.5
 _INSIDE = 0.94
 """The least share of a recess's area that must lie within the region."""
 _NEAR = 0.0025
-"""A point of an object's outline is shared with the region's outline if it is less than this far
-from it, in metres."""
+"""A point of an object's outline counts as shared if it is less than this far from the region's
+outline, in metres."""
 _SHARED = 0.45
 """The least share of an object's outline that must be shared with the region's outline."""
 _COST = 0.0010
 """The largest mean distance, in metres, of an outline's shared points from the region's outline."""
 _UNEXPLAINED = 0.15
-"""If the objects found in a region leave more than this share of its area, each of them must agree
-clearly (`_CLEARLY`) with the region's outline."""
+"""If the objects found in a region leave more than this share of its area uncovered, each of them
+must agree clearly (`_CLEARLY`) with the region's outline."""
 _CLEARLY = 0.65
 """An object's outline agrees clearly with the region's outline if at least this share of the
 object's outline is shared."""
@@ -172,7 +172,8 @@ def _find(
     around: Outline,
     resolution: float,
 ) -> _Found | None:
-    """Finds the best pose of a recess's outline within a region; None if it fits nowhere."""
+    """Returns the object at the best pose of a recess's outline within a region; None if the
+    outline fits nowhere."""
     template = trace_outline(recess.mask, resolution)
     best: _Found | None = None
     for start in _starts(recess.mask, region, template, resolution):

@@ -139,7 +139,7 @@ class NetworkConfig:
         scales = (self.colour_std, self.height_std)
         if not all(map(math.isfinite, (self.colour_mean, self.height_mean, *scales))):
             raise ValueError(
-                "means and standard deviations must be finite, not "
+                "means and standard deviations of colours and heights must be finite, not "
                 f"{(self.colour_mean, self.height_mean, *scales)}"
             )
         if min(scales) <= 0:

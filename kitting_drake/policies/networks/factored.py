@@ -96,7 +96,7 @@ class Networks(nn.Module):
         self.config = config
         self.preset = PRESETS[config.preset]
         self.compute_type = torch.float32
-        """The floating-point type of the networks' inputs, in which they compute."""
+        """The floating-point type in which the networks compute, and of their inputs."""
         self.rotations: int | None = None
         """The number of crop rotations in a training step of the Transporter. Scene rotations are
         half as many. None uses the default of `transporter.draw_bins`. Other methods ignore it."""

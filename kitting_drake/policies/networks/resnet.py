@@ -14,7 +14,7 @@ from kitting_drake.policies.networks.layers.steerable import MixedPrecision, ups
 
 
 class PlainLayer(nn.Module):
-    """A convolution that computes in the type of its input and casts its weights to it."""
+    """A convolution that computes in the type of its input and casts its weights to that type."""
 
     def __init__(
         self, channels_in: int, channels: int, size: int, *, stride: int = 1, gain: float = 1.0

@@ -226,7 +226,8 @@ def coarse_bins(orientations: int) -> list[int]:
 
 
 def encodings_per_decision(orientations: int) -> int:
-    """Returns the number of crops that `TransporterNetworks.predict_place` encodes at N."""
+    """Returns the number of crops that `TransporterNetworks.predict_place` encodes at N
+    orientations."""
     coarse = len(coarse_bins(orientations))
     if coarse == orientations:
         return coarse
@@ -250,7 +251,8 @@ def draw_bins(
         step: the angle between neighbouring bins, in radians.
         random: the generator that draws the other bins.
         rotations: the number of bins to return, including the labels. Half of the drawn bins are
-            near a label, if there are enough. None draws the minimum of two bins per stratum.
+            near a label, if there are enough. If it is None, two bins are drawn in each stratum,
+            which is the minimum.
 
     Returns:
         A dict from bins to log weights in nats. Adding these to the logits makes the drawn bins

@@ -228,7 +228,10 @@ def _plain_state(
         if kind == "weights" and basis is not None:
             square = basis.dim() == 5 and basis.shape[3] == basis.shape[4]
             if tensor.dim() != 3 or not square or tensor.shape[2] != len(basis):
-                raise UserError(f"{path}: the weights of {layer} do not fit their kernel basis")
+                raise UserError(
+                    f"{path}: the weights of {layer} do not fit their kernel basis: give a file "
+                    "that `train` wrote"
+                )
             state[f"{layer}.weight"] = expand_kernel(tensor, basis)
         else:
             state[name] = tensor

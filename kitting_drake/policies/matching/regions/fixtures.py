@@ -15,7 +15,7 @@ Plane = NDArray[np.float64]
 """(3,): the height at (row, col) is `plane @ (row, col, 1)`, in metres."""
 
 Fixture = tuple[Mask, Plane]
-"""The convex hull of a fixture (rows, cols), and the plane of its top."""
+"""The mask (rows, cols) of a fixture's convex hull, and the plane of the fixture's top."""
 
 _MOST_FIXTURES = 4
 """The largest number of fixtures."""
@@ -114,7 +114,7 @@ def fit_table(height: NDArray[np.float32]) -> Plane:
 def find_fixtures(
     height: NDArray[np.float32], relief: NDArray[np.float32], resolution: float
 ) -> list[Fixture]:
-    """Finds the largest plateau, and other large plateaus if they have recesses."""
+    """Returns the fixtures: the largest plateau, and other large plateaus if they have recesses."""
     high = relief > _LEAST_FIXTURE_HEIGHT
     found: list[Fixture] = []
     largest = 0
@@ -150,8 +150,8 @@ def _has_recess(fixture: Mask, depth: NDArray[np.float64], resolution: float) ->
 def _find_fixture(
     height: NDArray[np.float32], relief: NDArray[np.float32], high: Mask, resolution: float
 ) -> Fixture | None:
-    """Finds the largest plateau among the high pixels. Returns its convex hull and the plane of its
-    top; None if there is no plateau."""
+    """Finds the largest plateau among the pixels of the mask `high`. Returns its convex hull and
+    the plane of its top; None if there is no plateau."""
     least = AreaLimits.of(resolution).fixture
     if high.sum() * resolution**2 < least:
         return None

@@ -56,7 +56,7 @@ _FLAT = 0.0006
 """The largest deviation, in metres, from a flat floor's median depth. Twice the noise is used
 instead if that is more."""
 _FLAT_SHARE = 0.7
-"""The share of a flat floor that deviates by at most `_FLAT` is larger than this."""
+"""On a flat floor, more than this share of the pixels deviates by less than `_FLAT`."""
 _BELOW_TOP = 0.001
 """The least depth, in metres, of a surface that counts as below the fixture's top."""
 _NOISY = 0.001
@@ -166,9 +166,9 @@ class Segmentation:
     def _is_fragment(self, recess: Region) -> bool:
         """Whether a region is only a fragment of a filled recess.
 
-        The larger part of the filled recess then shows the object's top, slightly below the
-        fixture's top. In a free recess, only narrow slots whose floor no camera sees look so
-        shallow, and they are the smaller part.
+        If it is, the rest of the recess shows the object's top, slightly below the fixture's top,
+        and is larger than the fragment. In a free recess, only narrow slots whose floor no camera
+        sees look so shallow, and these are smaller than the region.
         """
         if self.noise > CLEAN:
             return False

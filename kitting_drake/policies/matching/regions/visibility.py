@@ -31,15 +31,15 @@ _SWEPT = 0.5
 _LINES, _DEPTHS, _SWEEPS = 5, 4, 17
 """The numbers of samples along the pads, across a finger, and from finger to finger."""
 _INSIDE = 0.9
-"""The least share of an object that must lie within the workspace at its place."""
+"""The least share of a placed object that must lie within the workspace."""
 _OUT_OF_VIEW = 0.02
-"""The largest share of an object that may lie outside all cameras' views at its place."""
+"""The largest share of a placed object that may lie outside all cameras' views."""
 _RING = 3
-"""How far the surroundings of a place extend from the object, in pixels."""
+"""How far the surroundings of a placed object extend from it, in pixels."""
 _RING_SEEN = 0.5
-"""The least share that must be seen of the surroundings of a place."""
+"""The least share that must be seen of the surroundings of a placed object."""
 _PLACE_SEEN = 0.25
-"""The least share that must be seen of a place."""
+"""The least share that must be seen of the area in which a placed object will lie."""
 _BLIND = 0.020
 """The radius that is assumed for an object of unknown outline, in metres."""
 

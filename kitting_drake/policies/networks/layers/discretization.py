@@ -39,7 +39,9 @@ def discretization_matrix(
         raise ValueError(f"{orientations} orientations are not a multiple of {quotient}")
     odd = [j for j in frequencies if j % quotient]
     if odd:
-        raise ValueError(f"frequency {odd[0]} does not exist on SO(2)/C_{quotient}")
+        raise ValueError(
+            f"frequency {odd[0]} does not exist on SO(2)/C_{quotient}: use multiples of {quotient}"
+        )
     bins = orientations // quotient
     size = sum(2 if j else 1 for j in frequencies)
     # One period of the quotient must have this many bins.

@@ -77,7 +77,8 @@ def rotated_patterns(fibre: Regular, size: int) -> Tensor:
         size: the side of the kernel, odd, in pixels.
 
     Returns:
-        (M, B, size, size), float64: B patterns, each rotated counter-clockwise by 2 pi m / N.
+        (M, B, size, size), float64: B patterns, each rotated counter-clockwise by 2 pi m / N
+        for m = 0 to M - 1, where M = N / q.
     """
     reach = size // 2
     # This is an upper bound: escnn itself keeps about as many frequencies as the radius has pixels.

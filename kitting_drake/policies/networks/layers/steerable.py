@@ -206,7 +206,7 @@ def _shared_basis(
 
 
 @functools.lru_cache(maxsize=64)
-# escnn caches tensors, which must also work outside inference mode, so switch it off here.
+# escnn caches tensors that are also used outside inference mode, so switch that mode off here.
 @torch.inference_mode(False)
 def kernel_basis(in_fibre: Fibre, out_fibre: Fibre, size: int) -> Tensor:
     """Returns escnn's basis of the steerable kernels between two fibres, with the Fourier
