@@ -12,7 +12,7 @@ from kitting_drake.station import KittingStation
 from systems.placement import GONE
 
 _NOTHING_TO_DO = ("done", "nothing fits")
-"""The reasons for stopping that claim that nothing is left to do."""
+"""The reasons for stopping that claim that no more objects can be placed."""
 _UNJUDGED = ("", "interrupted")
 
 
@@ -105,7 +105,8 @@ def is_right(reason: str, station: KittingStation, root_context: Context) -> boo
 
 
 def _loose_and_free(station: KittingStation, root_context: Context) -> tuple[list[int], list[int]]:
-    """The objects in the cell that fill no goal, and the goals that are not filled."""
+    """The indices of the objects in the cell that fill no goal, and of the goals that are not
+    filled."""
     placements = station.placements(root_context)
     kept = station.kept_goals(root_context)
     filled = {item.goal for item in placements if item.success} | kept

@@ -140,8 +140,8 @@ class JointEnvironment(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-        """Makes the scene of a seed, as in `evaluate --seed N`. Without a seed, it chooses one at
-        random.
+        """Makes the scene of a seed, as in `evaluate --seed N`; returns its observation and `info`.
+        Without a seed, it chooses one at random.
 
         Raises:
             ValueError: the seed is invalid.

@@ -41,7 +41,7 @@ class Reliability:
     """A fitted logistic regression and the threshold for its result."""
 
     weights: dict[str, float]
-    """Weights by the name of the fact; the empty name is the constant term."""
+    """The weight of each fact, by the fact's name; the empty name has the constant term."""
     threshold: float
     """The least confidence at which the robot acts."""
 

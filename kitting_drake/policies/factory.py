@@ -131,7 +131,7 @@ def make_shape_matching(
         planner: parameters of the motion with which the hand will pick and place.
         recover: whether to correct failed insertions, take heaps apart and turn objects over.
     """
-    # Import SciPy lazily.
+    # Import SciPy only where shapes are matched.
     from kitting_drake.policies.matching.shape_matching import ShapeMatchingPolicy
 
     return ShapeMatchingPolicy(planner, recover=recover)

@@ -40,8 +40,8 @@ def recovery_action(
     """Returns an action that presses down or takes out a protruding object; None if no object
     protrudes or no correction is feasible.
 
-    Higher objects come first. An object that was already taken out and placed again stays where it
-    is.
+    Higher objects come first. An object that was already taken out and placed again is not taken
+    out once more.
 
     Args:
         inventory: the objects and recesses of the observation.
@@ -66,7 +66,7 @@ def recovery_action(
 def _press(
     observation: Observation, segmentation: Segmentation, region: Region, pickable: Mask
 ) -> PickPlaceAction:
-    """Presses on the highest visible part of a protruding object."""
+    """Returns the action that presses on the highest visible part of a protruding object."""
     mask = region.mask & pickable
     pixels, heights = np.argwhere(mask), segmentation.relief[mask]
     highest = pixels[heights >= np.percentile(heights, 80)].astype(float)
@@ -82,7 +82,8 @@ def _take_out(
     planner: PickPlaceParameters,
     tried: Sequence[PlanarPose],
 ) -> PickPlaceAction | None:
-    """Grips a protruding object and lays it on a free part of the table."""
+    """Returns an action that lays a protruding object on a free part of the table; None if there is
+    no such action."""
     resolution = observation.grid.resolution
     free = _free_place(segmentation, resolution)
     if free is None:

@@ -45,7 +45,7 @@ _GRASPS = 6
 def separating_action(
     inventory: Inventory, planner: PickPlaceParameters, failed_picks: Sequence[PlanarPose] = ()
 ) -> PickPlaceAction | None:
-    """Lays the topmost part of a heap on a free part of the table.
+    """Finds an action that lays the topmost part of a heap on a free part of the table.
 
     Args:
         inventory: the objects and recesses of the observation.
@@ -76,7 +76,7 @@ def separating_action(
 def turning_action(
     inventory: Inventory, planner: PickPlaceParameters, failed_picks: Sequence[PlanarPose] = ()
 ) -> PickPlaceAction | None:
-    """Turns over an object that lies upside down, by releasing it at the edge of a block.
+    """Finds an action that turns over an object, by releasing it at the edge of a block.
 
     Args:
         inventory: the objects and recesses of the observation.
@@ -84,8 +84,8 @@ def turning_action(
         failed_picks: gripper poses at which a grasp failed before; they are avoided.
 
     Returns:
-        The action for the first such object that has both a feasible grasp and a free edge to tip
-            over; None if there is none.
+        The action for the first object that lies upside down and has both a feasible grasp and a
+            free edge to tip over; None if there is none.
     """
     segmentation, grid = inventory.segmentation, inventory.observation.grid
     failed = failed_pixels(grid, failed_picks)

@@ -108,7 +108,7 @@ class ResNet(MixedPrecision):
     def forward(self, image: Tensor) -> Tensor:
         """Maps (batch, in channels, rows, cols) to (batch, out channels, rows, cols) in float32.
 
-        Computes in the type of the image. Its sides must be one more than a multiple of 8.
+        Computes in the type of the image. The image's sides must be one more than a multiple of 8.
         """
         features = F.relu_(self.stem(image.contiguous(memory_format=torch.channels_last)))
         for stage in self.down:

@@ -102,7 +102,7 @@ class UNet(MixedPrecision):
     def forward(self, image: Tensor) -> Tensor:
         """Maps (batch, in channels, rows, cols) to (batch, out channels, rows, cols) in float32.
 
-        Computes in the type of the image. Its sides must be one more than a multiple of 16.
+        Computes in the type of the image. The image's sides must be one more than a multiple of 16.
 
         Raises:
             ValueError: a side is not one more than a multiple of 16.

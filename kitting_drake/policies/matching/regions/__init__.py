@@ -1,1 +1,1 @@
-"""Finds the regions of o_t: fixtures, recesses and objects, and what of them is seen."""
+"""Finds the regions of o_t: fixtures, recesses and objects. Also finds which parts are seen."""
