@@ -267,7 +267,7 @@ def _opened(path: Path, *, keep: bool = False) -> Iterator[h5py.File]:
     except PermissionError as error:
         raise UserError(f"cannot read {path}: {error.strerror}") from error
     except (OSError, LookupError, TypeError, AttributeError, ValueError, RuntimeError) as error:
-        # h5py may raise any of these for damaged bytes.
+        # For damaged bytes, h5py may raise any of these exceptions.
         detail = f" ({error})" if isinstance(error, (OSError, ValueError)) else ""
         raise UserError(
             f"{path} is truncated or damaged{detail}: delete it and collect again"

@@ -179,7 +179,7 @@ def read_static_scenes(path: Path) -> StaticScenes:
             ends = file["batch_ends"][()] if "batch_ends" in file else np.array([len(scenes)])
             _check_batches(ends, len(scenes))
     except (OSError, LookupError, ValueError, TypeError, AttributeError, RuntimeError) as error:
-        # h5py may raise any of these for damaged bytes.
+        # For damaged bytes, h5py may raise any of these exceptions.
         reason = error if isinstance(error, (OSError, ValueError)) else "it is damaged"
         raise UserError(f"cannot read {path}: {reason}") from error
     return StaticScenes(grid, scenes, seed, versions, tuple(ends.tolist()))

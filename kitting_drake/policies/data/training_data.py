@@ -44,8 +44,8 @@ _NO_SCENE = (
     *("tries", "random_order", "distractors"),
     *("success_threshold", "position_threshold", "angle_threshold_deg"),
 )
-"""Task fields that do not affect the scene. (`distractors` adds boxes to the scene, but moves
-nothing else.)"""
+"""Task fields that do not affect where the objects and goals are. (`distractors` only adds boxes to
+the scene.)"""
 
 
 @dataclass(frozen=True)

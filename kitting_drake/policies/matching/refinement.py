@@ -65,7 +65,7 @@ _SAME_PLACE = 0.008
 _SAME_ANGLE = math.radians(8)
 """The angle, in radians, below which two grasps at similar places count as the same."""
 _NEAR = 6.0
-"""A position belongs to a region if it is less than this far from it, in pixels."""
+"""A position belongs to a region if their distance is less than this, in pixels."""
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ _MOST_FIXTURES = 4
 _COMPARABLE = 0.3
 """The least area of a further fixture, as a share of the largest fixture's area."""
 PLANE_BAND = 0.004
-"""A pixel belongs to a plane if its height differs from it by less than this, in metres."""
+"""A pixel belongs to a plane if their heights differ by less than this, in metres."""
 _LEAST_FIXTURE_HEIGHT = 0.015
 """The least height of a fixture above the table, in metres."""
 _LEAST_FIXTURE_AREA = 0.003

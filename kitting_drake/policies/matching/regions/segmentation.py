@@ -113,9 +113,9 @@ class Segmentation:
     def free_recesses(self) -> tuple[Region, ...]:
         """The recesses that contain no object.
 
-        They are wide, are seen, and have a flat floor. A filled recess differs: only the narrow
-        gaps around the object are deep enough to be seen, or the object's surface is not flat, or
-        most of this surface ends just below the fixture's top.
+        They are wide, are seen, and have a flat floor. In a filled recess, only the narrow gaps
+        around the object are deep, or the object's surface is not flat, or most of this surface
+        lies just below the fixture's top.
         """
         return tuple(
             item
