@@ -93,7 +93,7 @@ def main() -> int:
         identity = {
             **chosen.described,
             "versions": versions(),
-            # Detect tools that the user imported or annotated again.
+            # The digest changes when the user imports or annotates a tool again.
             "task_digest": files_digest(chosen.scenario.task.input_files(chosen.base)),
         }
         claim_folder(folder, "scenario.json", identity, of="scenario, tools or version")
@@ -158,8 +158,8 @@ def _add_export_flags(parser: argparse.ArgumentParser) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class _Export:
-    """The export of frames: each demonstration's frames in `frames/`, and the dataset in
-    `lerobot/`."""
+    """The export of frames: each demonstration's frames go to `frames/`, and the LeRobot dataset
+    made of them to `lerobot/`."""
 
     folder: Path
     frames: Path
@@ -187,7 +187,7 @@ class _Export:
         """Marks the folder `frames/` as belonging to this export.
 
         Raises:
-            UserError: the folder holds frames that were recorded in another way.
+            UserError: the folder holds other files, or frames of other cameras, width or rate.
         """
         described = dataclasses.asdict(self.recording)
         claim_folder(require_folder(self.frames), "recording.json", described, of="recording")
@@ -217,8 +217,8 @@ class _Export:
                 seed, found = outcome
                 if not isinstance(found, Demonstration):
                     raise UserError(
-                        f"the demonstration of seed {seed} could not be repeated: give another "
-                        "--output"
+                        f"the frames of seed {seed} are missing, and its demonstration could not "
+                        "be repeated: give another --output"
                     )
                 progress.advance(task)
         origin = contents.origin

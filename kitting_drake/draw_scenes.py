@@ -94,7 +94,7 @@ class _Parts:
             drawn_by: the versions, sources and designs that determine the scenes.
 
         Raises:
-            UserError: a file has another seed or version, or is damaged.
+            UserError: a file was drawn with another seed or version, or is damaged.
         """
         self._folder, self._seed, self._drawn_by = require_folder(folder), seed, drawn_by
         self._counts = {}
@@ -115,7 +115,9 @@ class _Parts:
             raise UserError(f"{error}: delete it to draw it again") from error
         mine = (self._seed_of(batch), self._drawn_by, PixelGrid())
         if (found.first_seed, found.versions, found.grid) != mine:
-            raise UserError(f"{path} has another seed or version: delete it to draw it again")
+            raise UserError(
+                f"{path} was drawn with another seed or version: delete it to draw it again"
+            )
         return found
 
     def _seed_of(self, batch: int) -> int:
@@ -125,7 +127,7 @@ class _Parts:
         return self._folder / f"batch_{batch:06d}.h5"
 
     def draw(self, count: int, workers: LocalWorkers, console: Console) -> None:
-        """Draws batches until those before the first missing one hold `count` scenes."""
+        """Draws batches until the first `count` scenes are complete."""
         begun = set(self._counts)
 
         def next_batch() -> int | None:
@@ -150,7 +152,7 @@ class _Parts:
                 self._count(outcomes)
 
     def _count(self, outcomes: Iterable[tuple[int, int | ProcessCrashed]]) -> None:
-        """Counts the scenes of each batch when it ends."""
+        """Stores the number of scenes of each batch as the batch ends."""
         for batch, outcome in outcomes:
             if isinstance(outcome, ProcessCrashed):
                 raise UserError(
@@ -169,14 +171,14 @@ class _Parts:
         return sum(self._counts.values()) + unfinished
 
     def _gapless(self) -> int:
-        """Returns the number of scenes in the batches before the first missing one."""
+        """Returns the number of scenes in the batches before the first missing batch."""
         batches = itertools.takewhile(self._counts.__contains__, itertools.count())
         return sum(self._counts[batch] for batch in batches)
 
     def assemble(self, count: int, path: Path) -> tuple[StaticScene, ...]:
         """Writes the first `count` scenes to one file; returns them."""
         batches = [self._read(batch).scenes for batch in sorted(self._counts)]
-        # A batch is empty if no toolset fits into a kit.
+        # Leave out the ends of empty batches, for which no toolset fitted into a kit.
         ends = sorted({*itertools.accumulate(len(scenes) for scenes in batches)} - {0})
         everything = tuple(itertools.chain.from_iterable(batches))
         content = StaticScenes(PixelGrid(), everything, self._seed, self._drawn_by, tuple(ends))

@@ -306,7 +306,9 @@ class KittingStation(Diagram):
             ValueError: `diagram` is None, but the station is part of a Diagram.
         """
         if diagram is None and self.GetSystemPathname().strip(":").count("::"):
-            raise ValueError("make_simulator needs the outermost Diagram that contains the station")
+            raise ValueError(
+                "the station is part of a Diagram: pass the outermost Diagram to make_simulator"
+            )
         simulator = Simulator(self if diagram is None else diagram)
 
         def step(root_context: Context) -> EventStatus:

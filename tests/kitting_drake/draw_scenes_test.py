@@ -70,7 +70,7 @@ def test_assembles_scenes_with_the_ends_of_batches(tmp_path: Path):
 def test_batches_of_another_seed_or_version_are_refused(tmp_path: Path):
     draw_scenes._Parts(tmp_path, 0, OURS).draw(20, AtOnce(), Console(quiet=True))
     for seed, drawn_by in [(1, OURS), (0, {"kitting_drake": "0.2"})]:
-        with pytest.raises(UserError, match=r"batch_000000\.h5 has another seed or version"):
+        with pytest.raises(UserError, match=r"batch_000000\.h5 was drawn with another seed"):
             draw_scenes._Parts(tmp_path, seed, drawn_by)
     path = tmp_path / "batch_000000.h5"
     path.write_bytes(path.read_bytes()[:1000])
