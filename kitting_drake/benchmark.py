@@ -454,7 +454,7 @@ def _mujoco(arguments: argparse.Namespace, console: Console, folder: Path) -> li
 
 
 def _paper(arguments: argparse.Namespace, console: Console, folder: Path) -> int:
-    """Runs the experiments of the paper's cells; returns the exit code."""
+    """Runs the experiments for cells of the result tables; returns the exit code."""
     from kitting_drake.reproduction.paper.paper_tables import choose_cells
     from kitting_drake.reproduction.paper.queue import Queue, run_paper
 

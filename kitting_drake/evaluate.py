@@ -126,8 +126,8 @@ def evaluate(
 ) -> Evaluation:
     """Runs an episode for each seed.
 
-    Episodes that are in `folder/episodes.jsonl` already are skipped. Each new episode is appended
-    when it ends, with the commit of the code that ran it.
+    Seeds whose episodes are already in `folder/episodes.jsonl` are not run again. Each new episode
+    is appended when it ends, with the commit of the code that ran it.
 
     Args:
         chosen: the scenario.
@@ -233,7 +233,7 @@ def _work(chosen: ChosenScenario, seed: int, log: Path | None) -> Episode | str:
 
 @functools.cache
 def _commit_of_process() -> str | None:
-    """Returns the commit at this process's first episode, which is that of the loaded code."""
+    """Returns the commit of the code that runs. It is read at this process's first episode."""
     return commit()
 
 

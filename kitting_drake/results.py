@@ -1,9 +1,9 @@
 """`python -m kitting_drake.results`: writes the pages of results from the runs in docs/results/.
 
 The pages are docs/results.md with its figures, docs/protocol.md, and the tables in
-docs/robustness.md. `--add` adds a run of `evaluate` to the runs, and `--remove` removes one. A run
-with the name of a cell of `benchmark paper` fills this cell; it is refused if it was made with
-uncommitted changes.
+docs/robustness.md. `--add` adds a run of `evaluate` to the runs, and `--remove` removes one. A cell
+of a table shows the run that has the cell's name (see `benchmark paper`). Such a run is refused if
+it was made with uncommitted changes.
 
 The folder also has `learning_rates.json` from `benchmark paper`, and a copy of `networks.json` from
 `benchmark networks`. All numbers come from this folder, except those of the paper.

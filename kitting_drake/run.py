@@ -127,7 +127,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _save_replay(path: Path, meshcat: Meshcat | None) -> None:
-    """Saves the recording, if there is one; removes an earlier one otherwise."""
+    """Saves the recording. If there is none, removes the file of an earlier run."""
     path.unlink(missing_ok=True)
     if meshcat is not None:
         meshcat.StopRecording()

@@ -96,7 +96,7 @@ def _settings(
         learning_rate=arguments.learning_rate,
         decay=arguments.decay,
         taken_only=arguments.taken_only or not assumed.later_picks_possible,
-        # The Transporter rotates whole images, so it has no crop to bend.
+        # Curvature augmentation bends crops, but the Transporter rotates whole images.
         rigid=arguments.rigid or not assumed.curvature or arguments.method == "transporter",
         reflection=assumed.reflection and not arguments.rigid,
         colour=learned.colour if begun is None else begun.colour,
@@ -134,7 +134,7 @@ def _checked_start(
         )
     fixed = ["method", "preset", "orientations"]
     if arguments.angle_only:
-        # The new pick-angle network may have another N and size.
+        # --angle-only trains a new pick-angle network, which may have another N and size.
         fixed = ["method"] if config.has_unets_of(arguments.preset) else ["method", "preset"]
     for flag in fixed:
         given, found = getattr(arguments, flag), getattr(config, flag)
@@ -360,7 +360,7 @@ def _split(
 
 
 def _most_unrelated(data: TrainingData, wanted: int) -> int:
-    """Returns how many of the first items to train on.
+    """Returns the number n of demonstrations or scenes to train on: the first n of the data.
 
     It is the largest number, up to `wanted`, after which the data can be split into unrelated parts
     (see `TrainingData.unrelated`). If there is no such number, it is `wanted`.

@@ -66,7 +66,7 @@ def load_scenario(
     if perturb is not None:
         overlay = perturbation(perturb, scenario)
         # The last matching paint wins, but a merge over an existing pattern would keep the
-        # pattern's position. Remove it first.
+        # pattern's position. So remove the existing pattern first.
         kept = {
             name: paint
             for name, paint in scenario.appearance.paints.items()
@@ -82,11 +82,11 @@ def load_scenario(
 
 
 def _onto(raw: dict, defaults: Scenario) -> tuple[dict, Scenario]:
-    """Prepares YAML and defaults for merging.
+    """Returns the YAML and the defaults, prepared for merging.
 
-    Drake reads an untagged mapping as the first type of a union. This function adds the tag of the
-    present value's type. If a tag selects another type, the given mappings replace that type's
-    default mappings.
+    Drake reads an untagged mapping as the first type of a union. This function therefore adds the
+    tag of the default's type. If the YAML selects another type of task, each mapping in it replaces
+    the default mapping of the new type. Cameras that are null in the YAML are removed from both.
     """
     tagged = dict(raw)
     for name in ("task", "policy", "robot"):
@@ -130,7 +130,7 @@ def _without_mappings(given: dict, current: Task) -> Task:
 
 
 def _of_variant(given: object, current: object) -> object:
-    """Adds the tag of the present value's type to an untagged mapping."""
+    """Adds the tag of the type of `current` to `given` if that is a mapping without a tag."""
     return {"_tag": f"!{type(current).__name__}", **given} if isinstance(given, dict) else given
 
 

@@ -345,11 +345,11 @@ class PythonPolicy(PolicyConfig):
 
 @dataclass(frozen=True)
 class _OfObservationAlone:
-    """Wraps a function that takes only an observation. The failed picks are ignored."""
+    """Calls a function that takes only an observation, and ignores the failed picks."""
 
     function: Callable[[Observation], PickPlaceAction]
     forgets: bool = False
-    """Whether the history is removed from the observation as well."""
+    """Whether the function gets the observation without its history."""
 
     def __call__(
         self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()

@@ -54,9 +54,9 @@ class FrankaArm:
     # default is small, because a real arm compensates most of its friction.
     friction: list[float] = bounded([0.003] * 7, 0.0, 100.0)
 
-    # The hand waits at planner.home, but no higher than this, in m. At the default height it hides
-    # at most 11 mm of the workspace's border from one of the default cameras, and it is above the
-    # largest height of o_t, 0.28 m.
+    # The hand waits at planner.home, but no higher than this, in m. At the default height the hand
+    # hides at most 11 mm of the workspace's border from one of the default cameras. This height is
+    # above the largest one in o_t, 0.28 m.
     highest_wait: float = bounded(0.31, 0.0, 2.0)
 
     # Standard deviation of the noise of the external joint torques, in N m, from which the arm

@@ -28,7 +28,7 @@ _PLACES = 9
 """Number of waiting positions to check along the workspace's y axis, because the hand may wait at
 any y."""
 _BORDER = 0.015
-"""Width of the border of the workspace that may be hidden, in m: no object fits in there."""
+"""A border of the workspace of this width, in m, may be hidden: no object fits into it."""
 
 
 def hidden_table_note(scenario: Scenario) -> str | None:

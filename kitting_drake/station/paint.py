@@ -23,7 +23,7 @@ from kitting_drake.scenario.appearance import Appearance, Drawn, Fixed, Light, P
 from systems.sensor_noise import SHEEN_LABELS
 
 _COLOUR_STREAM, _LIGHT_STREAM = 11, 12
-"""Numbers of this module's random streams, which NumPy gets together with the seed."""
+"""Numbers of this module's random streams: a generator is seeded with [seed, number]."""
 _FLATTEST_LIGHT = 0.35
 """Least ratio between the downward and the horizontal component of a drawn light's direction."""
 
@@ -157,8 +157,8 @@ def _replace(
     role: Role,
     properties: PerceptionProperties | IllustrationProperties,
 ) -> None:
-    """Replaces the properties of a role. `AssignRole` alone cannot replace perception properties,
-    and prints a warning for illustration properties."""
+    """Replaces a geometry's properties for a role. `AssignRole` alone cannot replace perception
+    properties, and prints a warning for illustration properties."""
     source = plant.get_source_id()
     scene_graph.RemoveRole(source, geometry, role)
     scene_graph.AssignRole(source, geometry, properties)

@@ -22,7 +22,7 @@ from systems.rest_detector import BoundedBody, Box
 _X_WTABLE = RigidTransform([0.5, 0.0, 0.0])
 
 _VARIATION_STREAM = 13
-"""Number of this module's random stream, which NumPy gets together with the seed."""
+"""Number of this module's random stream: a generator is seeded with [seed, number]."""
 
 
 def add_plant(builder: DiagramBuilder, scenario: Scenario) -> tuple[MultibodyPlant, SceneGraph]:
@@ -111,7 +111,7 @@ def set_initial_poses(
 
 
 def bounded_body(plant: MultibodyPlant, scene_graph: SceneGraph, body: RigidBody) -> BoundedBody:
-    """Computes the boxes around a body's collision geometry."""
+    """Returns a body with one box around each of its collision geometries."""
     inspector = scene_graph.model_inspector()
     boxes = []
     for geometry in plant.GetCollisionGeometriesForBody(body):

@@ -19,14 +19,14 @@ from systems.signals import PlanarPose, SurfaceHeights
 
 
 def check_scene_reach(scene: Scene, motion: RobotMotion, parameters: PickPlaceParameters) -> None:
-    """Raises an error if an arm reaches no object or no goal of a scene. A floating hand reaches
-    all.
+    """Raises an error if an arm reaches none of a scene's objects, or none of its goals. A floating
+    hand reaches all.
 
     It is no error if some objects or goals are out of reach: actions on them are refused during the
     episode.
 
     Raises:
-        UserError: all objects that can fill a goal are out of reach, or all goals.
+        UserError: all goals, or all objects that can fill a goal, are out of reach.
     """
     if not isinstance(motion, ArmMotion):
         return
@@ -81,7 +81,7 @@ def _goal_problems(
 
 
 def _first_problem(stops: Iterable[HandStop], motion: ArmMotion) -> str:
-    """Says why an arm cannot reach the first stop, if it can reach none of them; else empty."""
+    """Says why an arm cannot reach the first stop; empty if it can reach at least one stop."""
     first = ""
     for stop in stops:
         problem = reach_problem(motion.postures, [stop])
