@@ -193,8 +193,8 @@ def planar(tip: NDArray[np.float64], q7: NDArray[np.float64]) -> NDArray[np.floa
     the hand.
 
     Joints 3 and 5 are at zero. This is one of the solutions of `inverse`. It also exists when the
-    elbow is straight above the shoulder, where `inverse` is singular. The hand also points down at
-    all joint positions on the straight line between two such positions in joint space.
+    elbow is straight above the shoulder, where `inverse` is singular. On a straight line in joint
+    space between two such positions, the hand always points down.
 
     Args:
         tip: (..., 3) the point midway between the fingertip ends, in B, in m.
@@ -273,7 +273,7 @@ def inverse_of_flange(
     with np.errstate(invalid="ignore", divide="ignore"):
         toward = reach / distance
         at_wrist = np.arccos((distance**2 + _FORE**2 - _UPPER**2) / (2 * distance * _FORE))
-        # `between` is the angle between the line to the shoulder and -z5, the axis of the forearm.
+        # `between` is the angle at the wrist between the shoulder and -z5, the axis of the forearm.
         between = math.atan2(_A4, _D5) + _ELBOW * at_wrist
         # Compute -z5, which lies in the plane of x6 and y6.
         along_x, along_y = np.sum(toward * x6, -1), np.sum(toward * y6, -1)

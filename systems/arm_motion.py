@@ -339,7 +339,7 @@ class ArmMotion(JawMotion):
         return self.jaws_arrival(state, state.way_start + self._way(state).duration)
 
     def brakes_above(self, state: PlannerState, time: float, height: float) -> bool:
-        """Whether the hand is above a height. An arm does not brake between `LIFT` and `CARRY`."""
+        """Whether the hand has reached a height, or the lift is complete. See `RobotMotion`."""
         q = self.motion_at(state, time)[:JOINTS]
         arrived = time >= self.arrival(state)
         return bool(arrived or self.postures.hand_pose(q)[2] >= height - _SAME_HEIGHT)

@@ -43,8 +43,8 @@ by less than this, in metres."""
 _ROLLED = math.radians(20.0)
 """A tilt below this, in radians, does not count as caused by rolling."""
 _ROLLED_PITCH = math.radians(10.0)
-"""The axis of a round object deviates by less than this, in radians, from the x axis of its frame
-B."""
+"""The axis about which a round object rolls is assumed to deviate by less than this, in radians,
+from x of its frame B."""
 _UPSIDE_DOWN = math.radians(120.0)
 """An object tilted by more than this, in radians, lies upside down."""
 _ON_EDGE = math.radians(60.0)

@@ -31,8 +31,8 @@ _AT_REST = (Mode.OBSERVE, Mode.DONE)
 
 def known_payload(state: PlannerState) -> float:
     """The vertical force of the held object on the hand, in N, negative downwards. It is the
-    measured force until the object has been weighed, then the object's weight. It is zero in other
-    modes than `LIFT`, `CARRY`, `LOWER` and `SEARCH`."""
+    measured force until the object has been weighed, then the object's weight. It is zero in all
+    modes except `LIFT`, `CARRY`, `LOWER` and `SEARCH`."""
     mode = Mode(int(state.mode))
     if mode in (Mode.LOWER, Mode.SEARCH):
         return state.payload

@@ -100,8 +100,7 @@ class HandMotion(JawMotion):
         self.set_times(state)
 
     def _set_goals(self, state: PlannerState, mode: Mode) -> None:
-        """Sets the goal of a mode. In the modes that are not named here, the hand brakes to
-        rest."""
+        """Sets the goal of a mode, or leaves it where the braking hand comes to rest."""
         parameters = self._parameters
         if mode == Mode.APPROACH:
             state.goal = (*state.pick[:2], state.pick_hover_z, state.pick[2])

@@ -21,18 +21,19 @@ moment is below this, in N m."""
 _NOTABLE_MOMENT = 0.10
 """A moment that a poor grip might not hold, in N m."""
 _INDULGENCE = 0.5
-"""Each time an object was set down again, the allowed moment grows by this share."""
+"""Each time an object was set down again, the allowed moment grows by this fraction of its first
+value."""
 _LONGEST_LEVER = 0.12
 """Largest plausible distance of a centre of mass from the pads' middle, in m."""
 _SOFT, _SOFT_SHARE = 0.006, 0.2
 """If the jaws sink farther into an object than this, in m, or than this share of its width, they
 press less."""
 _MUCH_LESS = 0.85
-"""The force on an object into which the jaws sink is reduced only if it falls to this share of its
-present value, or below."""
+"""The force on an object into which the jaws sink is lowered only if the new force is at most this
+share of the present one."""
 _GENTLE, _GENTLEST = 0.5, 0.25
-"""Shares of the acceleration limits: the largest one for an object that may turn, and the least one
-for any object."""
+"""Fractions of the acceleration limits. An object that may turn is moved with at most `_GENTLE` of
+them; no object is moved with less than `_GENTLEST` of them."""
 _GENTLER = 0.8
 """A motion is restarted when its acceleration should be less than this share of the present one."""
 _LEAST_CHANGE = 1.05
@@ -87,7 +88,7 @@ def soft_force(
 ) -> float:
     """The force of the pads on an object that gives way, in N.
 
-    Pads that go through a thin wall would neither hold it well nor let it go again.
+    Pads that pierce a thin wall would neither hold the object well nor release it.
 
     Args:
         force: the result of `grip_force`, in N.
@@ -100,7 +101,7 @@ def soft_force(
     soft = min(_SOFT, _SOFT_SHARE * width)
     most = max(peak * (soft / max(sunk, soft)) ** 2, parameters.grasp_force)
     if most > _MUCH_LESS * present:
-        # Keep the present force, so that its ramp is not restarted.
+        # Do not lower the force for so little, because each change restarts its ramp.
         most = max(most, present)
     return min(force, most)
 

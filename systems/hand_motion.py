@@ -13,7 +13,7 @@ SMOOTHING = 1 / 16
 """Rise time of the acceleration, in s."""
 
 PARTS = ([0, 1], [2], [3])
-"""Indices of the axes that move in step with each other: (x, y), z and yaw."""
+"""Indices of the axes of each part of a motion: (x, y), which move in step, then z, then yaw."""
 
 
 @dataclass(frozen=True)

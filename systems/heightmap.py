@@ -193,8 +193,8 @@ def _see(view: View, grid: PixelGrid) -> NDArray[np.float32]:
 
 
 def _sortable(values: NDArray[np.float32]) -> NDArray[np.int32]:
-    """Maps float32 numbers to integers of the same order, bit by bit. Applied to its own result,
-    the function returns the bits of the numbers."""
+    """Maps float32 numbers to int32 numbers that have the same order. Applied to its own result,
+    viewed as float32, the function returns the bits of the original numbers."""
     bits = values.view(np.int32)
     return np.where(bits < 0, bits ^ np.int32(0x7FFFFFFF), bits)
 

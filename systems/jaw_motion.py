@@ -11,7 +11,7 @@ class JawMotion:
     """Computes jaw openings and closing forces in all modes from the planner's state."""
 
     settles = math.inf
-    """Infinite, because the parameter `tare_settle` sets this time. See `RobotMotion`."""
+    """Infinite: `tare_settle` sets how long the hand needs to come to rest. See `RobotMotion`."""
 
     def __init__(self, parameters: PickPlaceParameters) -> None:
         """

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from systems.signals import PlanarPose
 
 _OUTSIDE = (0.15, 0.6)
-"""An object is released with its centre of mass outside the block's edge. Its distance from the
-edge is a share of the width with which the object lies on the block. This is the range of the
-share."""
+"""Range of the distance of the object's centre of mass outside the block's edge when the object is
+released, as fractions of the width with which the object lies on the block."""
 _MOST_OUTSIDE = 0.008
 """Largest distance of the centre of mass outside the edge, in metres."""
 _BESIDE = 0.005

@@ -12,7 +12,7 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem
 from systems.pick_place_parameters import Mode
 
 _FREE_MODES = (Mode.RETREAT, Mode.OBSERVE)
-"""The modes in which the hand is empty."""
+"""The modes in which an object may appear: the hand is empty and does not approach an object."""
 _STILL_THERE = 1.0
 """An object within this distance, in metres, of its waiting position is still waiting."""
 

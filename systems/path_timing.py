@@ -66,7 +66,7 @@ def fastest_times(
     slopes = spline.c[2]
     first = np.vstack([slopes, spline(len(points) - 1, 1)])
     second = spline(np.arange(len(points)), 2)
-    # u may be between -b - k x and b - k x in each row.
+    # The limits of acceleration require -b - k x <= u <= b - k x in each row.
     steep = np.where(np.abs(first) < _LEAST, _LEAST, first)
     b, k = limits.acceleration / np.abs(steep), second / steep
     speed = np.where(steep > 0, limits.high, limits.low) / steep
@@ -79,7 +79,7 @@ def fastest_times(
 
 
 def _solvable(b: NDArray[np.float64], k: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(n) the largest x for which some u satisfies the limits of all rows."""
+    """(n) the largest x at each point for which some u satisfies |u + k x| <= b in all rows."""
     gap = k[:, :, None] - k[:, None, :]
     room = b[:, :, None] + b[:, None, :]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -91,7 +91,7 @@ def _largest(
     highest: list[float], b: NDArray[np.float64], k: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """(n) the largest x = (ds/dt)^2 at each point, from one pass backwards and one forwards."""
-    # If x is at most e at the next point, x (1 - 2 k) must be at most e + 2 b in each row.
+    # To reach x <= e at the next point, x (1 - 2 k) must be at most e + 2 b in each row.
     with np.errstate(divide="ignore"):
         gain = np.where(1 - 2 * k > 0, 1 / (1 - 2 * k), _UNLIMITED)
     rise = 2 * b * gain

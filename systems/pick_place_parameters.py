@@ -52,8 +52,8 @@ class PickPlaceParameters:
     # The hand moves fast until it is this far above the surfaces around its goal in o_t, in m.
     hover_clearance: float = bounded(0.010, 0.001, 0.1)
 
-    # Depth of the fingertips below the top of the grasped object, in m. It is a share of the
-    # object's height above its support, within limits. On a round handle the pads should be near
+    # The fingertips go below the object's top by `grasp_depth_share` of its height, but by at least
+    # `grasp_depth` and at most `max_grasp_depth`, in m. On a round handle the pads should be near
     # the widest section.
     grasp_depth: float = bounded(0.010, 0.001, 0.05)
     max_grasp_depth: float = bounded(0.018, 0.001, 0.05)
@@ -83,9 +83,9 @@ class PickPlaceParameters:
     # A grasp counts as empty if the squeezing pads are closer to each other than this, in m.
     minimum_width: float = bounded(0.0005, 0.0, 0.08)
 
-    # Force in N with which closed jaws press down an object that sticks out of its cavity, and the
-    # largest depth, in m below the object's top, to which they go. They touch it at `touch_speed`;
-    # the force overshoots by about 5 N.
+    # Closed jaws press down an object that sticks out of its cavity with `press_force`, in N, and
+    # go at most `press_depth`, in m, below its top. They touch it at `touch_speed`; the force
+    # overshoots by about 5 N.
     press_force: float = bounded(30.0, 1.0, 140.0)
     press_depth: float = bounded(0.020, 0.001, 0.05)
 
@@ -98,8 +98,8 @@ class PickPlaceParameters:
     # lateral force.
     force_limit: float = bounded(30.0, 5.0, 140.0)
 
-    # Highest linear speed (m/s) and acceleration (m/s^2) in free space, for (x, y) and z each. The
-    # joint limits of an arm are not considered.
+    # Highest linear speed (m/s) and acceleration (m/s^2) in free space, for (x, y) and z each. An
+    # arm may be slower, because of the limits of its joints.
     linear_speed: float = bounded(1.2, 0.01, 1.2)
     linear_acceleration: float = bounded(8.0, 0.1, 9.0)
 
@@ -135,7 +135,8 @@ class PickPlaceParameters:
     # is released slowly swings about the pads.
     force_ramp: float = bounded(0.03, 0.0, 5.0)
 
-    # How long the hand rests, in s, before the cameras look, and before the payload is tared.
+    # How long the hand rests before the cameras look (`observe_settle`) and before the payload is
+    # tared (`tare_settle`), in s.
     observe_settle: float = bounded(0.10, 0.0, 10.0)
     tare_settle: float = bounded(0.10, 0.0, 10.0)
 

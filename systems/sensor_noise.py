@@ -20,9 +20,9 @@ SHEEN_LABELS = 20000
 """The render label SHEEN_LABELS + p marks a shiny surface, p percent of which become holes."""
 
 _RIG_STREAM, _CAMERA_STREAM, _DEPTH_STREAM = 14, 15, 16
-"""Numbers of this module's random streams, which NumPy gets together with the seed. Each stream of
-the package has its own number. Zero is avoided, because NumPy treats [seed, 2, 0] like [seed,
-2]."""
+"""Numbers of this module's random streams: a generator's seed begins with [seed, number]. Each
+stream of the package has its own number. Zero is avoided, because NumPy treats [seed, 2, 0] like
+[seed, 2]."""
 _TIME_RESOLUTION = 1e-6
 """Images farther apart in time than this, in seconds, have independent noise."""
 _HOLE_RADIUS = 3.0

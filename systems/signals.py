@@ -128,8 +128,8 @@ class Observation:
 _FILL_REACH = 25
 """A hole is filled from neighbours at most this far away, in pixels."""
 _SHADOW = np.ones((3, 3), bool)
-"""A hole into which this square fits may be the shadow of an object. Narrower ones are gaps between
-the points of a camera."""
+"""A hole into which this square fits may be the shadow of an object. A narrower hole is a gap
+between points that a camera measured."""
 _HIDDEN_BELOW = 0.005
 """Pixels around a shadow that are higher than the lowest of them by more than this, in metres, may
 belong to the object that casts the shadow."""

@@ -35,10 +35,11 @@ _FLAT = 0.012
 """Squares whose heights range over more than this, in metres, contain edges and are not flat."""
 _NOISY_RIM_SHARE, _NOISY_RIM_BIAS = 90.0, 1.0
 """Percentile of the heights around a place that estimates its rim's height, and the bias of this
-estimate in standard deviations. About two thirds of these heights belong to the rim."""
+estimate in standard deviations of the noise. About two thirds of these heights belong to the
+rim."""
 _NOISY_FLOOR_SHARE, _NOISY_FLOOR_BIAS = 25.0, -0.67
 """Percentile of the heights at a place that estimates its floor's height, and the bias of this
-estimate in standard deviations."""
+estimate in standard deviations of the noise."""
 _SUNK = 0.003
 """A table that looks lower than expected by more than this, in metres, is assumed to be lower."""
 _TILT_DOUBT, _MOST_DOUBT = 0.3, 0.0025

@@ -12,7 +12,7 @@ from systems.arm_limits import JOINTS
 from systems.trajectory_controller import FINGERS
 
 _STREAM = 17
-"""Number of this module's random stream, which NumPy gets together with the seed."""
+"""Number of this module's random stream: a generator is seeded with [seed, number, time]."""
 
 
 class WristForce(LeafSystem):
