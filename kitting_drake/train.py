@@ -355,7 +355,9 @@ def _split(
             f"{validation} and {path} share seed {shared}: validation needs other seeds"
         )
     if held_out.grid != everything.grid:
-        raise UserError(f"{validation} and {path} have different pixel grids")
+        raise UserError(
+            f"{validation} and {path} have different pixel grids: give data with the same grid"
+        )
     return learned, held_out
 
 

@@ -5,9 +5,9 @@ is Rot_x(alpha) Trans_x(a) Rot_z(q) Trans_z(d); source: Franka's FCI documentati
 "Denavit-Hartenberg parameters". The Franka Hand is mounted at the flange, rotated about z by -pi/4.
 
 Frames: B is the arm's base, F its flange, G the gripper frame of `systems.hand_geometry`. A hand
-pose is (x, y, z, yaw) of G in the world: the hand's z axis points down, its x axis along
-(cos yaw, sin yaw). The axis of joint 7 then points down too, so a rotation of joint 7 by -a turns
-the hand by a yaw of +a.
+pose is (x, y, z, yaw) of G in the world: its z axis points up, its x axis along
+(cos yaw, sin yaw). The axis of joint 7 then points down, so a rotation of joint 7 by -a turns the
+hand by a yaw of +a.
 """
 
 from __future__ import annotations

@@ -19,7 +19,8 @@ _BAND = 0.004
 """A pixel belongs to a plane if it is within this distance, in metres, or within three times the
 noise if that is more."""
 _FITS = 8
-"""Number of fits of the plane, each to more pixels or to nearer ones."""
+"""Number of fits of the plane. The first half use ever more pixels, the second half only those
+nearest to the plane."""
 _LEVEL = 0.0003
 """A table whose deviations are smaller than this, in metres, counts as level."""
 _MOST_OFF, _STEEPEST = 0.010, 0.035

@@ -112,7 +112,7 @@ def _onto(raw: dict, defaults: Scenario) -> tuple[dict, Scenario]:
 def _without_mappings(given: dict, current: Task) -> Task:
     """Returns the task over which `given` is merged.
 
-    This is `current`. If `given` selects another type of task, it is the default task of that type,
+    This is `current` if `given` has its type. Otherwise it is the default task of the given type,
     with empty mappings in place of those that `given` replaces.
     """
     for variant in typing.get_args(Task):
