@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 def list_tools(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
-    """Prints a table of the generated tools."""
+    """Prints a table of the available tools."""
     print_tools(args.models, entries, args.names, Console(markup=False))
 
 

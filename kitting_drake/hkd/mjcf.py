@@ -126,7 +126,7 @@ def block_prisms(
         for low, high in itertools.pairwise(levels)
     ]
     prisms: list[NDArray[np.float64]] = []
-    # Start at the top: the area that each layer adds becomes prisms down to the bottom.
+    # Go down from the top. Each layer adds a region; make it prisms down to the block's bottom.
     above = CrossSection()
     for layer, top in zip(reversed(layers), reversed(levels[1:]), strict=True):
         prisms += [_prism(part, levels[0], top) for part in _convex_parts(layer - above)]

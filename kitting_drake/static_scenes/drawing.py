@@ -92,7 +92,7 @@ _IN_CAVITY = 0.0008
 
 @dataclass(frozen=True)
 class Obstacle:
-    """Something beside a loose tool."""
+    """The kit, a box or another tool, which may be in the way when a loose tool is picked."""
 
     outline: CrossSection
     """The outline in the world, seen from above, in metres."""
@@ -333,7 +333,7 @@ def _actions(number: int, loose: LooseTool) -> list[tuple[float, ...]]:
     rows: list[tuple[float, ...]] = []
     X_WT, X_WGoal = loose.X_WT, loose.X_WGoal
     if not _lies_flat(X_WT):
-        # The tool must be laid aside before it can be placed, so it has no actions.
+        # The tool must be laid flat before it can be placed, so it gets no actions.
         return rows
     yaw = RollPitchYaw(X_WT.rotation()).yaw_angle()
     rotation = RollPitchYaw(X_WGoal.rotation()).yaw_angle() - yaw

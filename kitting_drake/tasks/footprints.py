@@ -19,8 +19,8 @@ from systems.hand_geometry import FINGER_DEPTH, FINGER_LENGTH, MAX_OPENING, PALM
 from systems.signals import PixelGrid
 
 OPEN_FINGERS = (FINGER_LENGTH, MAX_OPENING + 2 * FINGER_DEPTH)
-"""Size of the area of the open fingers and of the gap between them, seen from above: along the pads
-and across them, in m."""
+"""Size of a rectangle that covers the open fingers and the gap between them, seen from above: along
+the pads and across them, in m."""
 
 _TRIES = 200
 _RESTARTS = 50
@@ -64,25 +64,24 @@ def separation(a: Polygon, b: Polygon) -> float:
 
 @dataclass(frozen=True)
 class Footprint:
-    """The area that an object or fixture covers on the table, in its own frame, in metres."""
+    """The part of the table that an object or fixture covers, in its own frame, in metres."""
 
     body: tuple[Polygon, ...]
-    """Convex pieces of the covered area."""
+    """Convex polygons that together make up the covered part."""
     grasps: tuple[Grasp, ...] = ()
     """Grasps at which the hand picks or places here. The open fingers need free space at each of
     them."""
     tall: bool = False
-    """Whether the object is so high, or will become so high, that the palm also needs free
-    space."""
+    """Whether the object is so high, or will become so high, that the palm cannot pass over it."""
 
     @cached_property
     def fingers(self) -> tuple[Polygon, ...]:
-        """The areas of the open fingers and of the gap between them, one for each grasp."""
+        """For each grasp, one polygon that covers the open fingers and the gap between them."""
         return self._at_grasps(OPEN_FINGERS)
 
     @cached_property
     def palm(self) -> tuple[Polygon, ...]:
-        """The areas that the palm covers, one for each grasp."""
+        """For each grasp, one polygon that covers the palm."""
         return self._at_grasps(PALM_SIZE)
 
     def moved(self, x: float, y: float, yaw: float) -> Placed:

@@ -255,8 +255,8 @@ class TaskConfig:
 
 
 def last_action_on(name: str, records: Sequence[ActionRecord]) -> ActionRecord | str:
-    """Returns the last action in which the hand held an object, or the cause of the failure if
-    there is none."""
+    """Returns the last action in which the hand held the object `name`. If there is none, returns
+    the cause of the failure."""
     attempted = [
         item for item in records if item.outcome not in ("unfinished", "pressed", "unreachable")
     ]

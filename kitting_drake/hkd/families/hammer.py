@@ -173,7 +173,7 @@ def _handle(p: HammerParameters) -> tuple[Shape, Shape]:
 
 
 def _across_y(profile: np.ndarray, y: float) -> np.ndarray:
-    """Returns a section (n, 3) of a loft along y, with the profile's axes along x and z."""
+    """Returns a section (n, 3) of a loft along y; the profile's axes become -x and z."""
     return np.column_stack([-profile[:, 0], np.full(len(profile), y), profile[:, 1]])
 
 

@@ -67,7 +67,7 @@ class Section(NamedTuple):
 
 
 def head_loft(stations: Sequence[Section], octagonal: bool = False) -> Shape:
-    """Makes a loft through sections. Its hulls have fewer corners than its solid."""
+    """Makes a loft through sections. The collision hulls have fewer corners than the solid."""
 
     def sections(segments: int) -> list[np.ndarray]:
         rings = []

@@ -293,7 +293,10 @@ def _scaled_ring(length: float, u: float, v: float) -> tuple[float, ...]:
 
 
 def _height(length: float, low: float, high: float, share: float) -> float:
-    """Returns a height in proportion to the length, within the limits of the hand and a kit."""
+    """Returns the length times a factor, within the limits of the hand and a kit.
+
+    The factor is `low` for a share of 0, and `high` for a share of 1.
+    """
     return min(max(_between(low, high, share) * length, THINNEST_MM + 1.0), 30.0)
 
 
@@ -442,7 +445,7 @@ def _prism(profile: np.ndarray, height: float) -> Shape:
 
 
 def _around(profile: np.ndarray) -> CrossSection:
-    """Returns a square that contains every profile. With this cell alone, a plate has one hull."""
+    """Returns a square larger than any part. If it is the only cell, a plate gets one hull."""
     return CrossSection.square((2 * LONGEST_MM, 2 * LONGEST_MM), True)
 
 

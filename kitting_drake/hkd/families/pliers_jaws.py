@@ -1,7 +1,8 @@
 """Outlines of the upper jaw of pliers, by kind; the lower jaw is its mirror image.
 
 The points of an outline run clockwise from the joint over the back to the tip, and return along the
-biting edge.
+biting edge. Each function in OUTLINES draws one kind of jaw: it returns the points of the back and
+the points of the biting edge.
 """
 
 from collections.abc import Callable

@@ -110,7 +110,7 @@ def _shaft_parts(p: ScrewdriverParameters) -> list[Part]:
 def _tee(p: ScrewdriverParameters, height: float) -> list[tuple[str, Shape]]:
     """Builds a bar across the end of the shaft, flat above and below, and the hub around the shaft.
 
-    The handle's width is the length of the bar, and the handle's length is that of the hub.
+    The bar is `handle_width_mm` long, and the hub is `handle_length_mm` long.
     """
     depth = 0.36 * p.handle_width_mm
     sections = []

@@ -121,8 +121,8 @@ def _shoulders(p: WrenchParameters, head: Head, side: int) -> CrossSection:
 def _shank_cells(p: WrenchParameters) -> list[CrossSection]:
     """Returns regions that cut the shank into convex parts.
 
-    The part of the shank that a head covers is left to the head. The list is empty if a head has no
-    shoulders, unless this head is a tail or a spike.
+    The part of the shank that a head covers is left to the head. For a straight shank, the list is
+    empty if a head has no shoulders and is neither a tail nor a spike.
     """
     half, far = p.center_distance_mm / 2, 100.0
     if p.swing_mm:

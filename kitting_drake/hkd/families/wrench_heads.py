@@ -58,7 +58,7 @@ class HeadShape:
 
     # The forged outline, which is merged with the shank's outline.
     profile: CrossSection
-    # The area that is cut out after the merge: the slot of an open end, or the hole of a box.
+    # The region that is cut out after the merge: the slot of an open end, or the hole of a box.
     cut: CrossSection
     # Separate parts that replace forged material: jaws, screws and rings.
     inserts: list[Part] = field(default_factory=list)

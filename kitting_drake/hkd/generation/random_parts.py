@@ -1,7 +1,6 @@
 """Random solids for training: flat outlines, rings, plates, discs, rods and bolts.
 
-They are a share of the random tools (`random_tools`), so that networks train on more than hand
-tools.
+`random_tools` mixes them with random hand tools, so that networks train on more than hand tools.
 """
 
 import math

@@ -37,11 +37,11 @@ Array = NDArray[np.float64]
 _LENGTHS, _SHORT, _LONG = (0.11, 0.23), (0.05, 0.11), (0.23, 0.32)
 """The ranges of the lengths of usual, short and long tools, in metres."""
 _UNUSUAL = 0.12
-"""The share of short tools, which is also the share of long tools."""
+"""The share of lengths that are drawn from `_SHORT`; an equal share is drawn from `_LONG`."""
 _HIGHEST = 0.046
 """The largest height that fits into a kit's block, in metres."""
 _COMPOSED, _PARTS = 0.2, 0.3
-"""The share of tools that are composed of simple solids, and the share of simple parts."""
+"""The shares of the random tools that are composed of simple solids, and that are simple parts."""
 _JITTER = 0.22
 """The logarithm of the largest factor by which a length or an angle of a design changes."""
 _REFINED = 6.0
@@ -188,7 +188,8 @@ class _Warp:
     stretch: Array
     """The factors (2,) along y and z."""
     splay: float
-    """The share by which the end toward +x is wider than the middle, and the other end narrower."""
+    """The fraction by which the end toward +x is wider than the middle, and the other end narrower;
+    negative for the opposite."""
     bend: Array
     """The sideways offset is bend[0] u^2 + bend[1] u^3, in half lengths of the tool. At the ends of
     the tool, u is -1 and 1."""

@@ -62,9 +62,9 @@ def carrying_grasps(tool: Tool) -> tuple[Grasp, ...]:
     """Returns the grasps by which to carry a tool, best first.
 
     A heavy tool that is gripped far from its centre of mass turns between the pads. If the weight's
-    moment about the pads is at most `_EASY_MOMENT` at the annotated grasp, the tool's own grasps
-    are returned. Otherwise the grasps of `all_grasps` are returned, sorted by how much the moment
-    exceeds `_EASY_MOMENT`, the least excess first.
+    moment about the pads is at most `_EASY_MOMENT` at the annotated grasp, `tool.grasps` are
+    returned. Otherwise, the grasps of `all_grasps` are returned, sorted by how much the moment at
+    each of them exceeds `_EASY_MOMENT`, least first.
 
     Raises:
         UserError: as for `all_grasps`.

@@ -36,8 +36,8 @@ FLOOR_CLEARANCE = PLANNER.floor_clearance
 RELEASE_REACH = PLANNER.release_clearance + FINGERTIP_DEPTH
 """The distance beyond the gripped faces that the fingertips need when they release."""
 
-# A pad touches the surface up to this depth behind its foremost point: in the fine search, and in
-# the coarse search.
+# A pad touches the parts of the surface that are at most this far behind its foremost point: in the
+# fine search, and in the coarse search.
 _TOUCH = 0.0003
 _COARSE_TOUCH = 0.0008
 # The distance from the middle of a tool in its kit to a neighbouring tool.
@@ -189,7 +189,8 @@ def _search(
         levels: the heights of the slices, in metres.
         com: (2,) the centre of mass in T, in metres.
         theta: the rotation of the hand, in radians.
-        touch: a pad touches the surface up to this depth behind its foremost point, in metres.
+        touch: a pad touches the parts of the surface that are at most this far behind its foremost
+            point, in metres.
         planner: the planner's parameters.
         corners: whether a corner may be held.
         near: (2,) the point in T close to which to search; None searches along the whole tool.

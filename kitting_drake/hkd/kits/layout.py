@@ -210,9 +210,10 @@ def _quoted(tools: Sequence[Tool]) -> str:
 
 
 def released_fingers(tool: Tool) -> CrossSection:
-    """Returns the area under the fingers as they release a tool at its annotated grasp.
+    """Returns a rectangle for each finger, which covers it as it releases a tool.
 
-    The area is one rectangle for each finger, from the gripped face outward, in T, in metres.
+    The tool is held at its annotated grasp. A rectangle extends from the gripped face outward. The
+    rectangles are in T, in metres.
     """
     fingers = CrossSection()
     for side in (-1, 1):

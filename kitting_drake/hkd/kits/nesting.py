@@ -54,7 +54,7 @@ class NestedShape:
     outline: CrossSection
     """The shape's outline, which keeps its distance from all other outlines."""
     keep_out: CrossSection
-    """An area that no other shape's outline may overlap. Keep-out areas may overlap each other."""
+    """A region that no other shape's outline may overlap. Such regions may overlap each other."""
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ def nest_on(
     extents = [max(rotated[0].size) for rotated in parts]
     largest_first = sorted(range(len(shapes)), key=lambda i: -sizes[i])
     longest_first = sorted(range(len(shapes)), key=lambda i: -extents[i])
-    # The masks are conservative: shapes may fit even if the raster must be a cell or two larger.
+    # The masks are conservative: shapes may fit although their masks need a slightly larger strip.
     for order, lengthwise, excess in itertools.product(
         (largest_first, longest_first), (True, False), (0, 1, 2)
     ):
@@ -181,7 +181,7 @@ class _Part:
     def __init__(self, shape: NestedShape, yaw_deg: int, wall: float) -> None:
         self.yaw_deg = yaw_deg
         # `solid` has every cell that the outline touches. Two shapes keep the wall between them if
-        # no cell of one's `solid` is in the other's `walled`. They respect keep-out areas if no
+        # no cell of one's `solid` is in the other's `walled`. They respect keep-out regions if no
         # cell of one's `solid` is in the other's `keep_out`.
         solid = _grown(shape.outline.rotate(yaw_deg), _REACH)
         walled = _grown(shape.outline.rotate(yaw_deg), wall + _REACH)
@@ -281,7 +281,7 @@ def _fill_strip(
     from scipy import fft
 
     # The canvas is cyclic, because the Fourier transform is. This margin takes up the keep-out
-    # areas that reach beyond the strip and wrap around.
+    # regions that reach beyond the strip and wrap around.
     overhang = max(
         max(part.solid.shape[axis] - part.size[axis] for axis in (0, 1))
         for rotated in parts

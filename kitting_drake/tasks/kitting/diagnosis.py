@@ -104,7 +104,7 @@ def _is_over(p_WMiddle: np.ndarray, X_WB: RigidTransform, X_WGoal: RigidTransfor
 
 
 def _is_over_kit(scene: Scene, p_WPoint: np.ndarray) -> bool:
-    """Whether a point is over a kit. A kit's area is the bounding box of its seated tools plus a
+    """Whether a point is over a kit: within the bounding box of the kit's seated tools, plus a
     border."""
     return any(_is_over_one(scene, kit, p_WPoint) for kit in {goal.fixture for goal in scene.goals})
 

@@ -56,7 +56,7 @@ class KitPose(TablePose):
     riser: float = bounded(0.0, 0.0, MOST_RISER)
 
     # Rotation about the kit's own x and y axes, in degrees. The kit's lowest edge lies on the
-    # riser.
+    # riser, or on the table if there is none.
     roll_deg: float = bounded(0.0, -MOST_TILT_DEG, MOST_TILT_DEG)
     pitch_deg: float = bounded(0.0, -MOST_TILT_DEG, MOST_TILT_DEG)
 

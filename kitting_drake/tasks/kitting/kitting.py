@@ -88,7 +88,7 @@ class KittingTask(TaskConfig):
         return diagnosis.find_cause(scene, index, X_WB[index], placement, records)
 
     def fitted(self, tools: Sequence[Tool]) -> list[Tool]:
-        """Gives the tools the collision geometry that the kit's clearance requires.
+        """Returns the tools with the collision geometry that the kit's clearance requires.
 
         Raises:
             UserError: a tool's surface is not closed.
@@ -149,8 +149,8 @@ class _DrawnKitting(KittingTask):
 
     @property
     def not_perturbed(self) -> tuple[str, ...]:  # type: ignore[override]
-        """Names of perturbations that do not apply: there are distractor boxes only if the tools
-        lie apart on the table."""
+        """Names of perturbations that do not apply. Distractors need tools that lie apart on the
+        table."""
         return () if self.start == APART and not self.tray else ("distractors",)
 
     def _draw_scene(
@@ -161,8 +161,8 @@ class _DrawnKitting(KittingTask):
         tools = self.fitted(self._weighted(tools, seed))
         if self.start != APART or self.tray:
             return self._draw_settled(self.kit_of(tools), tools, grid, seed)
-        # Use separate random streams, so that with one level kit the poses do not depend on the
-        # parameters of kits and risers.
+        # Draw the tools and the stand of each kit from separate random streams, so that these draws
+        # do not change the poses.
         shares = self._shares(len(tools), np.random.default_rng([seed, 6]))
         kits = [self.kit_of([(models or tools)[index] for index in share]) for share in shares]
         stand_rng = np.random.default_rng([seed, 7])
@@ -209,7 +209,7 @@ class _DrawnKitting(KittingTask):
         )
 
     def _weighted(self, tools: list[Tool], seed: int) -> list[Tool]:
-        """Gives the tools their random masses. Identical tools have the same mass."""
+        """Returns the tools with random masses from `tool_mass`, equal for identical tools."""
         least, greatest = self.tool_mass
         if not greatest:
             return tools
@@ -422,8 +422,8 @@ class ToolsetKitting(_DrawnKitting):
 
 
 def _longest(tool: Tool, kit: KitParameters) -> float:
-    """The largest length, in metres, to which a tool can be scaled. It then still fits the jaws and
-    the kit's height, and weighs at most `HEAVIEST` kg."""
+    """The largest length, in metres, at which a scaled tool fits the jaws and the kit's height, and
+    weighs at most `HEAVIEST` kg."""
     factor = min(
         (MAX_OPENING - _JAW_MARGIN) / tool.grasp.width,
         (kit.height - kit.minimum_wall) / tool.height,

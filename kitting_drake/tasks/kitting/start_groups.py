@@ -54,7 +54,7 @@ class Group:
     members: dict[int, RigidTransform]
     """Pose of each member in the group's frame, by the tool's index or `KIT`."""
     outline: CrossSection
-    """The area that the group covers on the table, in the group's frame, in metres."""
+    """The outline of the group, seen from above, in the group's frame, in metres."""
 
 
 def start_groups(

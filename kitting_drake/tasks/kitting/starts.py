@@ -42,7 +42,7 @@ _TRIES, _RESTARTS = 200, 20
 
 @dataclass(frozen=True)
 class _Room:
-    """The area and the rotations that are allowed for the tools."""
+    """Where groups of tools may lie: the workspace, their spacing and their rotations."""
 
     grid: PixelGrid
     spacing: float
@@ -248,8 +248,10 @@ def _start(
 def _place(
     groups: Sequence[Group], area: CrossSection, room: _Room, rng: np.random.Generator
 ) -> list[RigidTransform] | None:
-    """Draws a pose in the world for each group, within the area and at a distance from each other;
-    None if there is no room."""
+    """Draws a pose in the world for each group; None if there is no room.
+
+    The groups lie within `area`, at least `room.spacing` apart.
+    """
     x_min, y_min, x_max, y_max = area.bounds()
 
     def draw(group: Group, placed: list[tuple[RigidTransform, CrossSection]]):

@@ -44,12 +44,12 @@ class TablePose:
 
 @dataclass(frozen=True)
 class _Footprint:
-    """The areas on the table that an object, and the open hand that grasps it, cover."""
+    """The outlines, seen from above, of an object and of the open hand that grasps it."""
 
     outline: CrossSection
     fingers: CrossSection
     palm: CrossSection
-    """The area of the palm. At a grasp, the palm passes over other tools, but not over a kit."""
+    """The outline of the palm. At a grasp, the palm passes over other tools, but not over a kit."""
 
     def moved(self, pose: TablePose) -> "_Footprint":
         return _Footprint(
@@ -237,7 +237,7 @@ def draw_boxes(
 ) -> list[DrawnBox]:
     """Draws boxes of random size and colour, for which the kits have no cavities.
 
-    The boxes keep clear of the kit, the tools, and the hand at each grasp. If there is not enough
+    The boxes keep clear of the kits, the tools, and the hand at each grasp. If there is not enough
     room, there are fewer than `count`.
 
     Args:

@@ -52,7 +52,7 @@ def _kit() -> KitParameters:
 
 @dataclass
 class AssemblingKits(PoseTask):
-    """Five flat shapes are put into the cavities of a kit, which are hollow, unlike in Ravens.
+    """Five flat shapes are put into the cavities of a kit. Unlike in Ravens, these are hollow.
 
     Each episode draws the shapes, their places in the kit, and all poses. Success is measured as in
     Ravens. The results also contain ADD-S, and the success by the measure of ManiSkill's task of
@@ -66,8 +66,8 @@ class AssemblingKits(PoseTask):
     # project's shapes.
     shapes: str = ""
 
-    # Scale of these meshes along x, y and z, in metres per unit of the mesh. The default suits the
-    # meshes of Ravens.
+    # Scale of the meshes in `shapes` along x, y and z, in metres per unit of the mesh. The default
+    # suits the meshes of Ravens.
     scale: list[float] = bounded(list(RAVENS_SCALE), 1e-6, 1000.0)
 
     # The kit block and its cavities.
@@ -149,7 +149,7 @@ class AssemblingKits(PoseTask):
             raise type(error)(f"task.shapes: {error}") from error
 
     def _draw_places(self, tools: Sequence[Tool], rng: np.random.Generator) -> list[CavityPose]:
-        """Draws the headings of the cavities so that there are walls between them.
+        """Returns the poses of the cavities, with random headings that leave walls between them.
 
         Raises:
             UserError: a shape is too large for its place.

@@ -61,7 +61,7 @@ class RavensTask(TaskConfig):
         if X_WB[index].rotation().matrix()[2, 2] < _UPRIGHT:
             return TOPPLED
         if scene.success.share(placement, X_WB[index]) > 1 - 1e-9:
-            # The object is in place, but its prerequisites are not filled.
+            # The object is in place, but the goals that must be filled before its own are not.
             return PREREQUISITE_MISSING
         return cause
 
