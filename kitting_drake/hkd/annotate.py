@@ -75,13 +75,13 @@ def save_grasp(tool: Tool, grasp: Grasp, models: Path = MODELS) -> None:
         models: the folder with the catalogue in `tools/`.
 
     Raises:
-        UserError: the jaws do not open wide enough, or the generator rejects the grasp. Nothing is
-            changed then.
+        UserError: the tool is too wide for the jaws there, or the generator rejects the grasp.
+            Nothing is changed then.
     """
     if grasp.width > WIDEST:
         raise UserError(
-            f"the tool is {1e3 * grasp.width:.0f} mm wide at this place, but the jaws open only "
-            f"to {1e3 * WIDEST:.0f} mm: grasp it where it is narrower"
+            f"the tool is {1e3 * grasp.width:.0f} mm wide at this place, but the jaws hold at most "
+            f"{1e3 * WIDEST:.0f} mm: grasp it where it is narrower"
         )
     if tool.directory.parent != models / "tools":
         record_path = tool.directory / "tool.yaml"

@@ -22,7 +22,7 @@ Triangles = tuple[NDArray[np.float64], NDArray[np.int64]]
 class _Surface:
     """Collects the triangles of a surface, ring by ring.
 
-    Lengths are in metres. The triangles' normals point away from the cavity.
+    Lengths are in metres. The normals of a cavity's triangles point away from the cavity.
     """
 
     def __init__(self) -> None:
@@ -235,7 +235,8 @@ def contact_surfaces(cavities: Sequence[Cavity], parameters: KitParameters) -> d
     outside.add_walls(
         loops, outside.add_ring(loops, 0.0), outside.add_ring(loops, parameters.height)
     )
-    # The collected normals point away from the cavities; flip them to point out of the block.
+    # The normals of sides and floors point away from the cavities; flip them to point out of the
+    # block.
     return {
         "sides": _reversed(sides),
         "floors": _reversed(floors),

@@ -210,10 +210,9 @@ def _quoted(tools: Sequence[Tool]) -> str:
 
 
 def released_fingers(tool: Tool) -> CrossSection:
-    """Returns a rectangle for each finger, which covers it as it releases a tool.
+    """Returns the outlines of the fingers as they release a tool at its annotated grasp.
 
-    The tool is held at its annotated grasp. A rectangle extends from the gripped face outward. The
-    rectangles are in T, in metres.
+    They are two rectangles, each from a gripped face outward, in T, in metres.
     """
     fingers = CrossSection()
     for side in (-1, 1):

@@ -26,7 +26,7 @@ CAUSES = (MISSED_GRASP, SLIPPED, BLOCKED, WRONG_CAVITY, REVERSED, MISPLACED, NEV
 
 _NEAR = 0.030
 """A tool within this distance of a cavity, in m, counts as over the cavity. It is half the distance
-between two cavities."""
+between neighbouring cavities of the paper's kits."""
 _BORDER = 0.015
 """Width of the kit's border around the seated tools, in m."""
 _ALIGNED = math.radians(20.0)

@@ -136,8 +136,8 @@ class _DrawnKitting(KittingTask):
     tilt_deg: list[float] = bounded([0.0, 0.0], 0.0, MOST_TILT_DEG)
 
     # How the tools lie at the start: apart, touching (side by side, 0 to 3 mm apart), crossed (one
-    # across another), leaning (half of them against the kit block's sides), or heap (fallen from
-    # about 150 mm). Except for apart, a simulation lets the tools come to rest.
+    # across another), leaning (half of them, at most four, against the kit block's sides), or heap
+    # (fallen from about 150 mm). Except for apart, a simulation lets the tools come to rest.
     start: str = APART
 
     # Whether the tools start in a shallow tray.
@@ -220,7 +220,7 @@ class _DrawnKitting(KittingTask):
         return [weighted_tool(tool, drawn[tool.directory, tool.length]) for tool in tools]
 
     def _shares(self, count: int, rng: np.random.Generator) -> list[tuple[int, ...]]:
-        """Indices of the tools of each kit."""
+        """For each kit, the indices of its tools."""
         if count < self.kits:
             raise UserError(
                 f"task.kits is {self.kits}, but there are only {count} tools: give fewer kits"
@@ -277,7 +277,7 @@ class _DrawnKitting(KittingTask):
         ):
             raise ValueError(
                 "task.kits, task.riser and task.tilt_deg can be set only if task.start is apart "
-                f"and task.tray is false, but they are {self.start} and {str(self.tray).lower()}"
+                f"(not {self.start}) and task.tray is false (not {str(self.tray).lower()})"
             )
 
 

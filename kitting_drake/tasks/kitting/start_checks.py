@@ -44,7 +44,7 @@ _LEANS = math.radians(5.0)
 
 @dataclass(frozen=True)
 class Start:
-    """Poses of kit, tools and tray at the start of an episode, at rest."""
+    """Poses of kit, tools and tray, before or after the tools come to rest."""
 
     X_WKit: RigidTransform
     X_WTools: tuple[RigidTransform, ...]
@@ -94,7 +94,8 @@ class StartCheck:
         return self._kind != "touching" or self._is_graspable(X_WTools)
 
     def may_go_on(self, X_WTools: Sequence[RigidTransform]) -> bool:
-        """Whether the origins of all tools are still in the workspace and off the kit."""
+        """Whether all tools' origins are still in the workspace, off the kit and not below the
+        table."""
         for X in X_WTools:
             p_W = X.translation()
             on_kit = np.abs((self._drawn.X_WKit.inverse() @ p_W)[:2]) < self._kit_half

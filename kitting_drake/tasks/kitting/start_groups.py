@@ -156,7 +156,8 @@ def _heap(block: Group, kit: Kit, tools: Sequence[Tool], rng: np.random.Generato
 def _leaning(
     block: Group, kit: Kit, tools: Sequence[Tool], rng: np.random.Generator
 ) -> list[Group]:
-    """Lets half of the tools lean on different sides of the block. The others lie apart."""
+    """Lets half of the tools, at most four, each lean on a side of the block. The others lie
+    apart."""
     order = rng.permutation(len(tools)).tolist()
     leaning = order[: (len(order) + 1) // 2]
     sides = rng.permutation(4).tolist()
@@ -184,7 +185,7 @@ def _lean(kit: Kit, tool: Tool, side: int, rng: np.random.Generator) -> RigidTra
     room = max(other_half - _LEAN_CORNER, 0.0)
     along = float(rng.uniform(-room, room))
     splay, over = float(rng.uniform(-_LEAN_SPLAY, _LEAN_SPLAY)), float(rng.uniform(*_LEAN_OVER))
-    over = min(over, tool.length / 3)  # A short part also reaches the edge.
+    over = min(over, tool.length / 3)  # A short part extends less far over the edge.
     leads = bool(rng.integers(2))
     # Distance along the tool from the end on the table to the block's edge.
     reach = tool.length - over

@@ -169,7 +169,7 @@ def cluttered_scene(
     grid: PixelGrid,
     max_actions: int,
 ) -> Scene:
-    """Makes a scene in which the expert chooses among many grasps and may lay tools aside.
+    """Returns a scene changed so that the expert has many grasps and may lay tools aside.
 
     Args:
         scene: the scene of the kit and its tools, in the order in which the expert takes them.
