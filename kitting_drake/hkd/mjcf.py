@@ -126,7 +126,7 @@ def block_prisms(
         for low, high in itertools.pairwise(levels)
     ]
     prisms: list[NDArray[np.float64]] = []
-    # Go down from the top. Each layer adds a region; make it prisms down to the block's bottom.
+    # Go down from the top. Extend the region that each layer adds to prisms down to the bottom.
     above = CrossSection()
     for layer, top in zip(reversed(layers), reversed(levels[1:]), strict=True):
         prisms += [_prism(part, levels[0], top) for part in _convex_parts(layer - above)]

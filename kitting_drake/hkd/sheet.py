@@ -97,7 +97,7 @@ class Subject:
 def tool_subject(tool: Tool) -> Subject:
     """Returns the subject of a picture: a tool at rest on the table."""
     title = tool.name.replace("_", " ")
-    # View tools that are larger than the dataset's from farther away.
+    # If a tool is larger than those of the dataset, view it from farther away.
     size = 0.208 * max(1.0, tool.length / 0.2, tool.width / 0.13)
     return Subject(title, [(tool.sdf, RigidTransform())], (0.0, 0.0, 0.006), size)
 

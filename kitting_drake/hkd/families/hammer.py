@@ -46,7 +46,7 @@ class HammerParameters:
     claw_width_mm: float = 31.0
     claw_gap_mm: float = 11.0
     # The handle's widths along y at the eye, at the throat (the thinnest point) and at the swell of
-    # the grip. Then its thickness along z as a share of these widths.
+    # the grip. Then the handle's thickness along z as a share of these widths.
     eye_width_mm: float = 25.0
     throat_width_mm: float = 23.0
     swell_width_mm: float = 34.0

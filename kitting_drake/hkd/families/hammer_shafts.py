@@ -144,7 +144,7 @@ def _grip_stations(s: Shaft) -> list[tuple[float, float]]:
 def _loft(s: Shaft, top: float, stations: list[tuple[float, float, float]]) -> Shape:
     """Makes a loft through stations, each (share of the handle's length, width, thickness).
 
-    Its hulls have fewer corners than its solid.
+    The collision hulls have fewer corners than the solid.
     """
 
     def rings(segments: int) -> list[np.ndarray]:

@@ -45,7 +45,7 @@ _ROUND = 24
 _PAD = 17.6
 """The length of the jaws' pads."""
 _INNER_REACH = 58.0
-"""The distance from the grasp to the far side of a finger of the open jaws, plus 3 mm."""
+"""The distance from the grasp to the far side of an open finger, plus a margin of 3 mm."""
 _HEX = 2 / math.sqrt(3)
 """The ratio of a hexagon's width across corners to its width across flats."""
 

@@ -21,8 +21,8 @@ from kitting_drake.hkd.tools.solids import (
 class ScrewdriverParameters:
     """A screwdriver with its tip toward +x and the handle's front at x = 0. Lengths in mm."""
 
-    # The kind of handle: fluted (as described below), a key of screwdriver_handles.STYLES, tee (a
-    # bar across the end) or offset (a bar with an angled tip at each end, without a handle).
+    # The kind of handle: fluted, tee (a bar across the end), offset (a bar with an angled tip at
+    # each end, without a handle) or a key of screwdriver_handles.STYLES.
     handle: str = "fluted"
     # The kind of tip: flat, phillips, square, torx, hex or socket (a nut driver).
     tip: str = "flat"

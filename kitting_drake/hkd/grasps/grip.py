@@ -38,7 +38,7 @@ class Grip:
 
 
 def find_grip(triangles: Array, x: float, y: float, theta: float, length: float) -> Grip | None:
-    """Finds the part of a tool's surface between pads of a given length.
+    """Measures the part of a tool's surface that is between pads of a given length.
 
     Args:
         triangles: (n, 3, 3) the surface of a tool in its frame T.

@@ -40,7 +40,7 @@ class Kit:
     """
 
     sdf: Path
-    """A model with one link `kit` whose body frame is K."""
+    """The SDFormat file of the block: one link `kit`, whose frame is K."""
     tools: tuple[Tool, ...]
     layout: KitLayout
 

@@ -338,7 +338,7 @@ def _lowest_place(
 def _tightened(
     shapes: Sequence[NestedShape], placements: Sequence[_Placement], wall: float
 ) -> Nesting:
-    """Shrinks the rectangle of a nesting to the smallest around the placed shapes."""
+    """Returns the placed shapes on the smallest rectangle that holds them with their walls."""
     origins = [CELL * np.array([column, row]) - part.corner for part, (row, column) in placements]
     bounds = np.array(
         [

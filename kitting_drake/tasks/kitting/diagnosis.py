@@ -68,7 +68,7 @@ def find_cause(
     if goal is not None:
         X_WGoal = goal.poses[placement.pose]
         grasp_point = np.array([item.grasps[0].x, item.grasps[0].y, 0.0])
-        # Compare the grasp point as well: half a rotation about the grasp displaces the tool's
+        # Compare the grasp point as well: half a turn about the grasp displaces the tool's
         # middle, but not the grasp.
         if min(_gap(X_WB, X_WGoal, middle), _gap(X_WB, X_WGoal, grasp_point)) < _NEAR:
             # The error is modulo the tool's symmetry, so a symmetric tool cannot be reversed.

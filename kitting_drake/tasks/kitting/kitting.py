@@ -325,8 +325,8 @@ class Kitting(_DrawnKitting):
             )
         if self.cavities and (self.start != APART or self.tray):
             raise ValueError(
-                "task.cavities can be set only if task.start is apart and task.tray is false, but "
-                f"they are {self.start} and {str(self.tray).lower()}"
+                f"task.cavities can be set only if task.start is apart (not {self.start}) and "
+                f"task.tray is false (not {str(self.tray).lower()})"
             )
 
 

@@ -56,7 +56,7 @@ class ConvexBody:
     """A free body that consists of convex pieces, in its frame B and in SI units."""
 
     pieces: tuple[NDArray[np.float64], ...]
-    """For each piece, points (n, 3) of which the piece is the convex hull."""
+    """For each piece, points (n, 3) whose convex hull is the piece."""
     mass: float
     center_of_mass: NDArray[np.float64]
     inertia: NDArray[np.float64]

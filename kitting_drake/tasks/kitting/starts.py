@@ -169,10 +169,11 @@ def cluttered_scene(
     grid: PixelGrid,
     max_actions: int,
 ) -> Scene:
-    """Returns a scene changed so that the expert has many grasps and may lay tools aside.
+    """Returns a scene in which the expert chooses among `grasps` and may lay tools aside.
 
     Args:
-        scene: the scene of the kit and its tools, in the order in which the expert takes them.
+        scene: the scene to change, with the kit and its tools in the order in which the expert
+            takes them.
         kit: the kit.
         grasps: the grasps of the scene's objects, best first.
         start: the poses at the start.

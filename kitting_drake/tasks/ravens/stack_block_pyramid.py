@@ -42,7 +42,7 @@ _BASE = Footprint(
 
 @dataclass
 class StackBlockPyramid(PoseTask):
-    """Six cubes are stacked to a pyramid.
+    """Six cubes are stacked into a pyramid.
 
     The demonstrator grasps a cube on its centre line along y and gives it the heading of the base,
     so that the jaws open across the row.
