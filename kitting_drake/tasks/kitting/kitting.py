@@ -277,7 +277,8 @@ class _DrawnKitting(KittingTask):
         ):
             raise ValueError(
                 "task.kits, task.riser and task.tilt_deg can be set only if task.start is apart "
-                f"(not {self.start}) and task.tray is false (not {str(self.tray).lower()})"
+                f"and task.tray is false; task.start is {self.start}, and task.tray is "
+                f"{str(self.tray).lower()}"
             )
 
 
@@ -325,8 +326,8 @@ class Kitting(_DrawnKitting):
             )
         if self.cavities and (self.start != APART or self.tray):
             raise ValueError(
-                f"task.cavities can be set only if task.start is apart (not {self.start}) and "
-                f"task.tray is false (not {str(self.tray).lower()})"
+                "task.cavities can be set only if task.start is apart and task.tray is false; "
+                f"task.start is {self.start}, and task.tray is {str(self.tray).lower()}"
             )
 
 
