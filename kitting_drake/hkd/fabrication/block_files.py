@@ -71,7 +71,7 @@ def threemf_bytes(surface: Triangles, title: str, labels: Triangles | None = Non
 
     Args:
         surface: the block.
-        title: the title.
+        title: the title in the metadata, and the name of the object.
         labels: the letters of another colour that fill the engraved labels; None: there are none.
             With letters, the object has two parts, each with its own base material.
     """

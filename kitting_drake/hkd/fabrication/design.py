@@ -100,7 +100,7 @@ def design_kit(
 
 
 def solid(design: Design) -> Manifold:
-    """Returns the block as files have it: in mm, with its lower left corner at the origin."""
+    """Returns the block in the files' frame: in mm, with its lower left corner at the origin."""
     parameters = design.kit.parameters
     block = build_block(design.cavities, parameters)
     for recess in design.recesses:

@@ -232,7 +232,7 @@ def _bring_tools(tools: Sequence[Tool], folder: Path) -> list[str]:
     """Copies the user's own tools into `folder/tools/`.
 
     Returns:
-        For each tool, its name in the kit's scenario: a name, or the path of the copy.
+        The entry of each tool in the kit's scenario: its name, or the path of its copy.
     """
     names: dict[Path, str] = {}
     for tool in tools:

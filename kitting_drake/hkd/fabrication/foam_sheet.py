@@ -22,7 +22,7 @@ MOST_KITS = 60
 """The largest number of kits on a sheet."""
 
 _MIXTURES = 40
-"""The number of packings to try in which each copy is turned or not at random."""
+"""The number of packings to try in which randomly chosen copies are turned."""
 _SHEET, _BLOCK = "SHEET", "BLOCK"
 _STROKES = ("#0b5fa5", "#2b8a3e", "#9c36b5", "#d9480f", "#087f5b", "#a61e4d", "#5f3dc4")
 _COLOURS = (4, 3, 6, 30, 2, 1, 150, 80)
@@ -165,7 +165,7 @@ def fill_sheet(
 def _merit(places: Sequence[KitPlace], kits: Sequence[SheetKit]) -> tuple[int, float]:
     """Returns the number of different kits on the sheet, and the area in mm^2 that kits cover.
 
-    The better of two packings has more different kits. If they have equally many, it covers more.
+    The better of two packings has more different kits or, if the numbers are equal, covers more.
     """
     present = len({place.kit for place in places})
     return present, sum(math.prod(kits[place.kit].size) for place in places)
@@ -246,7 +246,7 @@ def _free_corner(
     """Finds the lowest (if `by_rows`) or leftmost place for a rectangle.
 
     Args:
-        room: the sides of the area that may be used, in mm.
+        room: the sides of the sheet without its margins, in mm.
         gap: the least distance from other rectangles, in mm.
         boxes: the placed rectangles (n, 4) as x_min, y_min, x_max, y_max, in mm.
         sides: the sides (2) of the rectangle to place, in mm.

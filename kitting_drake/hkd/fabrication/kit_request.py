@@ -52,7 +52,7 @@ class KitRequest:
     simulated kit are not.
     """
     lead_in_mm: float | None = None
-    """The width of the bevel around the rims. None: the default, 1 mm."""
+    """The width of the bevel around the cavities' rims. None: the default, 1 mm."""
     fit_of: tuple[tuple[str, float], ...] = ()
     """Pairs of a tool's name or path, and this tool's clearance, which replaces `clearance_mm`."""
     stand_out_mm: float = 0.0
@@ -255,7 +255,7 @@ def request_of(args: argparse.Namespace, robot: str) -> KitRequest:
         robot: see `KitRequest`.
 
     Raises:
-        UserError: flags do not go together.
+        UserError: a flag is given without another one that it needs.
     """
     if args.two_colours and not args.labels:
         raise UserError("--two_colours needs --labels")

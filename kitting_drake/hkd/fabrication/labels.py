@@ -26,9 +26,9 @@ _FARTHEST = 0.03
 """The largest distance of a label from its cavity, in metres."""
 _PLAINLY = 1.5
 """A label must be farther from other cavities than from its own, by at least this factor."""
-# The cost of a label's position, in metres, is the sum of: its distance from the cavity; a tenth of
-# its distance from the cavity's middle; 6 mm if the text is rotated; and minus 6 times the height
-# of its letters.
+# The cost of a label beside its cavity, in metres, is the sum of: the label's distance from the
+# cavity; a tenth of its distance from the cavity's middle; 6 mm if the text is rotated; and minus
+# 6 times the height of its letters.
 _DISTANCE_FOR_HEIGHT, _FROM_THE_SIDE, _OFF_THE_MIDDLE = 6.0, 0.006, 0.1
 _FONT_SIZE = 100.0
 

@@ -22,10 +22,11 @@ _WALL = 0.003
 _SLIDES = tuple(sign * step for step in np.arange(0.0, 0.041, 0.004) for sign in (1, -1))
 """The distances from the grasp, along the tool, at which a notch is tried, in metres."""
 _SHARES = (0.85, 1.15)
-"""The least and largest area of a notch outside its cavity, as shares of a half disc's area."""
+"""The least and largest area of the part of a notch outside its cavity, as multiples of the area of
+a half disc."""
 _FINS = 1.6
-"""A notch is refused if the test for thin fins in `_notch` finds a larger area than this multiple
-of the area that it finds at two right-angled corners without fins."""
+"""The largest area that the closing in `_notch` may fill, as a multiple of the area that it fills
+at two right-angled corners. A larger area means that the notch leaves a thin fin."""
 _OVERLAP = 0.001
 """The overlap of a notch with its cavity, in metres, so that no thin skin is left between them."""
 
@@ -156,9 +157,9 @@ def _notch(cavity: Cavity, disc: CrossSection, radius: float, wall: float) -> Cr
     share = beside.area() / (math.pi * radius**2 / 2)
     if len(beside.decompose()) != 1 or not _SHARES[0] <= share <= _SHARES[1]:
         return None
-    # Look for thin fins of the block between the notch and the cavity. A morphological closing of
-    # the empty area covers them. It also covers a little at the two corners where the notch meets
-    # the cavity, so compare its area with that at two right-angled corners.
+    # Look for thin fins of the block between the notch and the cavity: a morphological closing of
+    # the notch and cavity fills them. It also fills a little of the two corners where the notch
+    # meets the cavity, so compare the filled area with that at two right-angled corners.
     x_min, y_min, x_max, y_max = disc.bounds()
     near = CrossSection.square((x_max - x_min + 4 * wall, y_max - y_min + 4 * wall)).translate(
         (x_min - 2 * wall, y_min - 2 * wall)

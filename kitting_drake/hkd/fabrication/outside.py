@@ -2,7 +2,7 @@
 
 Gridfinity is a public standard of bins on a grid of 42 mm. The numbers are those of its published
 specification (https://gridfinity.xyz/specification/): a bin is 0.5 mm smaller than its cells, its
-corners have a radius of 3.75 mm, and each cell has a foot of 0.8 + 1.8 + 2.15 mm.
+corners have a radius of 3.75 mm, and each cell has a foot, 0.8 + 1.8 + 2.15 mm high.
 """
 
 import itertools
@@ -19,7 +19,8 @@ PITCH = 42.0
 GAP = 0.5
 """How much smaller a bin is than its cells, in mm."""
 FOOT = ((0.0, 35.6, 0.8), (0.8, 37.2, 1.6), (2.6, 37.2, 1.6), (4.75, 41.5, 3.75))
-"""The square sections of a foot from the bottom up: height, side and corner radius, in mm."""
+"""The square sections of a foot from the bottom up: height above the bottom, side and corner
+radius, in mm."""
 FOOT_HEIGHT = FOOT[-1][0]
 """The height of a foot, in mm."""
 
@@ -115,13 +116,13 @@ def _foot() -> Manifold:
 
 
 def _ring(size: tuple[float, float], radius: float, inset: float, z: float) -> NDArray[np.float64]:
-    """Returns the corners (n, 3) of a rounded rectangle at a height, in mm.
+    """Returns the vertices (n, 3) of a rounded rectangle inside a given one, in mm.
 
     Args:
-        size: the sides of the rectangle without the inset, in mm; its corner is at the origin.
-        radius: the radius of the inset rectangle's corners, in mm.
-        inset: the distance of the rectangle from the given sides, in mm.
-        z: the height, in mm.
+        size: the sides of the given rectangle, in mm; its lower left corner is at the origin.
+        radius: the radius of the returned rectangle's corners, in mm.
+        inset: the distance between the sides of the two rectangles, in mm.
+        z: the height of the vertices, in mm.
     """
     sides = np.array(size) - 2 * inset
     if radius:

@@ -24,7 +24,7 @@ class Piece:
     """A piece of a block, in the block's frame, in mm."""
 
     number: int
-    """The number of the piece, counted from 1. Pieces are laid down in the order of numbers."""
+    """The number of the piece, counted from 1. Pieces are put together in this order."""
     body: Manifold
     """The piece with its dovetails and sockets."""
     region: CrossSection
