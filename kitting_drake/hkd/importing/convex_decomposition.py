@@ -157,7 +157,7 @@ def _steps(shares: np.ndarray) -> list[float]:
     values, counts = np.unique(np.round(within, 3), return_counts=True)
     order = np.argsort(-counts, kind="stable")[:3]
     many = max(4, len(shares) // 50)
-    # Rounding may move a position off its vertices, so use the median of their exact positions.
+    # The values are rounded, so return the median of the exact positions near each.
     return [
         float(np.median(within[np.abs(within - values[i]) <= 6e-4]))
         for i in order

@@ -47,7 +47,7 @@ def true_length(
         length: the length of the tool at rest, in the unit of its file.
         height: the height of the tool at rest, in the unit of its file.
         unit: a key of `UNITS_MM` that the user or the file gives; None if unknown.
-        wanted_mm: the length to scale to, or None.
+        wanted_mm: the length in mm to scale to; None keeps the length in the file.
 
     Raises:
         UserError: several units are possible, or none, or the tool is too short or too long.
@@ -153,7 +153,7 @@ def _tool(
     if not proposals:
         raise UserError(
             f"at a length of {1e3 * length:.0f} mm the hand cannot hold the tool from above (the "
-            f"jaws open to at most {1e3 * WIDEST:.0f} mm)"
+            f"jaws open to at most {1e3 * WIDEST:.0f} mm): check --unit and --length_mm"
         )
     return Tool(
         directory=directory,
@@ -173,8 +173,9 @@ def _tool(
 def other_grasps(proposals: list[GraspProposal]) -> tuple[Grasp, ...]:
     """Selects the grasps to try after the first of `propose_grasps`, best first.
 
-    The grasp nearest to the centre of mass is always selected, because a tool that is held there
-    does not turn between the pads.
+    Grasps that cost much more than the first are left out. Of the others, the one nearest to the
+    centre of mass is always selected, because a tool that is held there does not turn between the
+    pads.
     """
     usable = [item for item in proposals[1:] if item.cost < proposals[0].cost + _MUCH_WORSE]
     chosen = usable[:_OTHERS]

@@ -119,9 +119,7 @@ def _check_replaceable(folder: Path, request: ImportRequest) -> str | None:
             f"{folder} has a grasp that you saved: give another --name, or delete the folder"
         )
     if file != request.mesh.name:
-        raise UserError(
-            f"{folder} is the tool of {file}: give another --name, or delete the folder"
-        )
+        raise UserError(f"{folder} was made from {file}: give another --name, or delete the folder")
     if request.mesh.is_file() and digest != digest_of(request.mesh):
         return f"replaces the tool of an older version of {file}"
     return None

@@ -57,7 +57,7 @@ def bodies_of(solid: Manifold, category: str, density: float | None = None) -> l
     if density is None and category in ("hammer", "screwdriver"):
         border = _border(solid, category)
         if border is not None:
-            # The normal points to the first of the two parts: the working end.
+            # The first part is the one to which the normal points: the working end.
             front, back = solid.split_by_plane((1.0, 0.0, 0.0), border)
             return [(front, _STEEL), (back, _HANDLE)]
     return [(solid, density or DENSITIES.get(category, OTHER_DENSITY))]

@@ -27,7 +27,7 @@ class Drawing:
     outline: CrossSection
     """The outline in mm."""
     measured: str
-    """A phrase for the user that says how lengths were measured."""
+    """A phrase for the user that says what gives the scale, such as `by its width and height`."""
     notes: list[str]
     """Phrases for the user on curves that were left out or closed."""
 
@@ -38,7 +38,7 @@ def is_outline(path: Path) -> bool:
 
 
 def read_drawing(path: Path, unit_mm: float | None = None, frame: str | None = None) -> Drawing:
-    """Reads the outline in a drawing: the area inside its largest closed curve, less its holes.
+    """Reads the outline in a drawing: the region inside its largest closed curve, less the holes.
 
     A page or frame around the outline is left out, and curves that are drawn twice count once.
     Lines, arcs and open polylines are joined where their ends meet.

@@ -147,7 +147,7 @@ def _surface(request: ImportRequest) -> tuple[np.ndarray, np.ndarray, list[str]]
 
     Returns:
         Vertices (n, 3), triangles (m, 3) and notes. The vertices of a mesh are in its own units,
-        those of an outline in mm. The first note on an outline says how it was measured.
+        those of an outline in mm. The first note on an outline says what gives its scale.
     """
     if not is_outline(request.mesh):
         return *read_mesh(request.mesh), []
@@ -269,5 +269,5 @@ def _properties(
 
 
 def _safe(text: str) -> str:
-    """Returns text in which no characters can end an XML comment."""
+    """Replaces special characters by underscores, so that a text cannot end an XML comment."""
     return re.sub(r"[^\w. ]|-", "_", text, flags=re.ASCII)

@@ -195,8 +195,7 @@ def _repaired(vertices: Array, faces: Faces) -> Manifold | None:
         fixer.fill_small_boundaries(0, False)
         solid = _fixed(fixer)
         if solid is None:
-            # This step is slow. It also removes surfaces that cross each other, which does no harm
-            # here.
+            # `clean` is slow, so it comes last. It also removes self-intersections.
             fixer.clean(10, 3)
             solid = _fixed(fixer)
     except RuntimeError:

@@ -28,9 +28,9 @@ _END = 0.3
 def to_tool_frame(solid: Manifold, category: str) -> Manifold:
     """Moves a solid (in mm) into the frame T of a tool of the given category; see `Tool`.
 
-    The pose is the stable pose with the lowest centre of mass. The working end is the wider end of
-    a hammer, the end nearer to the centre of mass of a wrench, and the narrower end of any other
-    tool.
+    The pose is the stable pose with the lowest centre of mass. For a hammer, the working end is the
+    wider end; for a wrench, the end nearer to the centre of mass; and for any other tool, the
+    narrower end.
 
     Raises:
         UserError: the solid is flat or has no stable pose.
@@ -124,7 +124,7 @@ def long_direction_deg(outline: CrossSection) -> float:
     directions = axis + np.arange(-_SIDEWAYS_DEG, _SIDEWAYS_DEG, 0.25)
     apart = (directions[:, None] - angles + 90.0) % 180.0 - 90.0
     votes = np.exp(-0.5 * (apart / _LIKE_DEG) ** 2) @ lengths
-    # To get a finer result than the search's steps, average the edges near the best direction.
+    # Refine the best direction: average the directions of the edges near it.
     near = apart[int(np.argmax(votes))]
     weights = lengths * np.exp(-0.5 * (near / _LIKE_DEG) ** 2)
     return float(directions[int(np.argmax(votes))] - np.average(near, weights=weights))

@@ -84,7 +84,7 @@ def enclosed(
 ) -> tuple[CrossSection, list[str]]:
     """Returns the outline of a tool, and notes for the user.
 
-    Pages and frames are left out first. The outline is then the area inside the largest closed
+    Pages and frames are left out first. The outline is then the region inside the largest closed
     curve and outside the other curves.
 
     Args:
@@ -124,7 +124,7 @@ def enclosed(
             )
     inner = outer.offset(-_LINE_MM, JoinType.Round)
     for hole in holes:
-        # A curve that is drawn twice, as a fill and as a line, is no hole.
+        # A curve that is drawn twice, as a fill and as a line, is not a hole.
         if hole.area() >= 0.999 * areas[0].area():
             continue
         if (inner - hole).area() < 0.001 * inner.area():
@@ -153,8 +153,8 @@ def _as_frame(
     if (
         frame == "tool"
         or box.area.area() < _BOX * sides.prod()
-        # In these two cases, the second curve is the rectangle drawn again, or the inner side of
-        # the rectangle's thick line.
+        # The next two conditions hold if the second curve is the rectangle drawn again, or the
+        # inner side of the rectangle's thick line.
         or box.area.area() < 1.02 * inside.area.area()
         or (box.area.offset(-_LINE_MM, JoinType.Miter) - inside.area).area()
         < 0.001 * box.area.area()

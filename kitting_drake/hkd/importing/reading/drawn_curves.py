@@ -37,11 +37,11 @@ class Curve:
 
 @dataclass(frozen=True)
 class DrawnCurves:
-    """The curves of a drawing, and how it was measured."""
+    """The curves of a drawing, and what gives their scale."""
 
     curves: list[Curve]
     measured: str
-    """A phrase for the user that says how lengths were measured."""
+    """A phrase for the user that says what gives the scale, such as `by its width and height`."""
     page_mm: tuple[float, float] | None = None
     """The size of the page in mm, if the drawing has one."""
     notes: list[str] = field(default_factory=list)

@@ -17,7 +17,8 @@ _NOTES = ("DIMENSION", "ARC_DIMENSION", "LARGE_RADIAL_DIMENSION", "LEADER", "MUL
 _SMOOTHED, _CONTROL_POINT = 4, 16
 """The flags of a smoothed polyline, and of a vertex that is only a control point."""
 _MORE_UNITS_MM = {8: 25.4e-6, 9: 0.0254, 21: 1200 / 3937 * 1e3, 22: 100 / 3937 * 1e3}
-"""Values of $INSUNITS that ezdxf does not convert: microinches, mils, US survey feet and inches."""
+"""The length in mm of each unit ($INSUNITS) that ezdxf does not convert: microinches, mils, US
+survey feet and US survey inches."""
 
 _END_MARK, _TAIL = re.compile(rb"^\s*EOF\b", re.MULTILINE), 1000
 """The end mark of a DXF, and the number of last bytes in which it is sought.

@@ -98,10 +98,11 @@ def _scale(root: ElementTree.Element, text: bytes, unit_mm: float | None) -> tup
     """Returns the length in mm of a pixel of svgelements, and a phrase that says how it is known.
 
     Raises:
-        UserError: the drawing has no size, and its scale cannot be inferred.
+        UserError: the scale cannot be inferred, or the page's size contradicts the pixels of the
+            program that wrote the file.
     """
     if unit_mm is not None:
-        # Without width and height, a pixel is one unit of the drawing.
+        # Remove the width and height, so that a pixel is one unit of the drawing.
         for name in ("width", "height"):
             root.attrib.pop(name, None)
         return unit_mm, f"by units of {unit_mm:g} mm as requested"
@@ -204,7 +205,7 @@ def _settle_size(root: ElementTree.Element) -> tuple[float, float]:
 def _match_rounded_box(root: ElementTree.Element, box: list[float]) -> None:
     """Restores the shorter side of a viewBox that was rounded to whole numbers.
 
-    Otherwise the drawing would be scaled by the error of that side.
+    Otherwise the rounding would change the drawing's scale.
     """
     lengths = [_length(root.attrib[name], name) for name in ("width", "height")]
     sides = [float(number) for number, _ in lengths]

@@ -471,7 +471,7 @@ def test_two_runs_into_one_folder(
         return make(request, name, directory)
 
     monkeypatch.setattr(importer, "prepare_tool", overtaken)
-    with pytest.raises(UserError, match=r"is the tool of first\.stl"):
+    with pytest.raises(UserError, match=r"was made from first\.stl"):
         bring(second, tmp_path / "tools", name="mine")
     monkeypatch.setattr(importer, "prepare_tool", overtaken)
     bring(first, tmp_path / "tools", name="mine")
