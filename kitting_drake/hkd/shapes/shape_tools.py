@@ -99,7 +99,7 @@ def shape_files(folder: Path) -> list[Path]:
         raise UserError(f"there is no folder {folder}: give a folder with meshes ({kinds})")
     found = sorted(path for path in folder.iterdir() if path.suffix.lower() in FORMATS)
     if not found:
-        raise UserError(f"{folder} has no meshes ({kinds})")
+        raise UserError(f"{folder} has no meshes: give a folder with meshes ({kinds})")
     return found
 
 
@@ -210,9 +210,9 @@ def _write(
 def _rank(proposal: GraspProposal) -> float:
     """Returns the cost of a grasp of a shape.
 
-    Shapes are far apart in their kit, so the penalty for neighbours is left out. The centre of mass
-    counts more than for a hand tool: a shape has no handle, and a grasp near its end touches only a
-    small part of the pads.
+    Shapes are far apart in their kit, so the cost of a close neighbour is left out. The centre of
+    mass counts more than for a hand tool: a shape has no handle, and a grasp near its end touches
+    only a small part of the pads.
     """
     beside = proposal.offset / _BESIDE
     return proposal.cost - proposal.penalties["neighbour in the kit"] + beside
@@ -222,8 +222,8 @@ def _check(solid: Manifold) -> None:
     length, width, height = size(solid)
     if max(length, width) > _LARGEST_MM:
         raise UserError(
-            f"the shape is {max(length, width):.0f} mm long, and may have at most "
-            f"{_LARGEST_MM:.0f} mm: give another scale"
+            f"the shape is {max(length, width):.0f} mm long, but may be at most "
+            f"{_LARGEST_MM:.0f} mm long: give another scale"
         )
     if not THINNEST_MM <= height <= HIGHEST_MM:
         raise UserError(

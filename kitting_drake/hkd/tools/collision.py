@@ -135,7 +135,7 @@ def _grown(profile: CrossSection, distance: float) -> CrossSection:
 
 
 def _fits(hull: _Hull, allowed: CrossSection, tolerance: float) -> bool:
-    """Whether the hulls from which a hull was merged may be replaced by it.
+    """Whether a merged hull may replace the hulls from which it was merged.
 
     The hull's xy projection must stay within `allowed`. Its other two projections may extend beyond
     those of its sources by at most `tolerance` (mm).
@@ -178,8 +178,8 @@ def cover(
 ) -> list[np.ndarray]:
     """Covers `hulls` with few convex hulls, which may overlap. The result is deterministic.
 
-    Each hull is a seed. It is repeatedly merged with the neighbour that adds the least volume. The
-    xy projection must stay within `allowed`; the other projections may grow by at most `tolerance`
+    Each hull is a seed. It is repeatedly merged with the neighbour that adds the least volume. Its
+    xy projection must stay within `allowed`; its other projections may grow by at most `tolerance`
     (mm). Then grown hulls are selected, each the one that covers the most uncovered volume, until
     all of `hulls` are covered. Finally, hulls that hardly change any projection are dropped.
     """

@@ -1,7 +1,8 @@
 """Collision hulls that follow a tool's outline closely, for cavities with little clearance.
 
-Lengths are in mm. The outline from above is cut into convex cells. Each hull encloses the part of
-the solid that lies above one cell, so no hull sticks out beyond the outline.
+Lengths are in mm. Convex cells cover the outline from above. Each hull encloses the part of the
+solid over one cell, or a horizontal slice of this part. Apart from rounding, hulls stick out beyond
+the outline only where cells bridge notches.
 """
 
 from collections.abc import Sequence
@@ -112,9 +113,9 @@ def without_notches(outline: CrossSection, notch: float) -> CrossSection:
 def convex_cells(inner: CrossSection, outer: CrossSection) -> list[CrossSection]:
     """Covers the region `inner` with few convex polygons that stay within `outer` and may overlap.
 
-    The largest uncovered triangle of `inner` grows by neighbouring triangles as long as their hull
-    is within `outer`. The hull of those that earlier cells do not cover is the new cell. This
-    repeats until all triangles are covered.
+    The region is triangulated. Starting from the largest uncovered triangle, neighbouring triangles
+    are added as long as the hull of all of them is within `outer`. The new cell is the hull of
+    those that earlier cells do not cover. This repeats until all triangles are covered.
     """
     loops = inner.to_polygons()
     corners = np.vstack(loops)

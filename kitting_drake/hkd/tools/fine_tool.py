@@ -18,8 +18,8 @@ from kitting_drake.hkd.tools.tool import Tool
 _FORMAT_VERSION = "3"
 """The version of the files in the cache. Increase it when equal inputs give different files."""
 _STIFFER = 25.0
-"""The factor for the hydroelastic modulus. It keeps the kit's walls from sinking into the tool by
-more than the clearance."""
+"""The factor by which the hydroelastic modulus is increased. It keeps the kit's walls from sinking
+into the tool by more than the clearance."""
 _LIST = "hulls.json"
 _DRAKE = "http://drake.mit.edu"
 
@@ -74,7 +74,8 @@ def _hulls(tool: Tool, notch: float, inside: float) -> list[Path]:
         )
     except ValueError as error:
         raise UserError(
-            f"the tool '{tool.name}' has no fine collision hulls: {error}; import its mesh again"
+            f"the tool '{tool.name}' cannot have fine collision hulls: {error}; import its mesh "
+            "again"
         ) from error
     return [folder / name for name in json.loads((folder / _LIST).read_text())]
 

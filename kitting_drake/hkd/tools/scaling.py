@@ -1,4 +1,4 @@
-"""Scaled and weighted tools: section IV-B.2 of the paper scales a toolset's tools at random.
+"""Tools with another size or mass; section IV-B.2 of the paper scales a toolset's tools at random.
 
 A uniform scale s at constant density multiplies all lengths by s, the mass by s^3 and the moments
 of inertia by s^5.
@@ -33,8 +33,8 @@ _DRAKE = "http://drake.mit.edu"
 def scaled_tool(tool: Tool, length: float) -> Tool:
     """Scales a tool uniformly to a length in metres; returns it unchanged if it has that length.
 
-    The scaled tool has its own SDFormat file in the cache, which scales the original's meshes. It
-    keeps the name and all other properties of the original.
+    The scaled tool has its own SDFormat file in the cache, which scales the original's meshes. The
+    mass and the grasps are scaled, too; `other_grasps` that become too wide are dropped.
 
     Raises:
         UserError: the length is not positive, the model cannot be scaled, or the cache cannot be
@@ -106,7 +106,7 @@ def weighted_tool(tool: Tool, mass: float) -> Tool:
 
 
 def _excess_moment(grasp: Grasp, root: ElementTree.Element, mass: float) -> float:
-    """Returns by how much the weight's moment about the pads exceeds `_EASY_MOMENT`, in N m."""
+    """Returns by how much the weight's moment about the pads exceeds `_EASY_MOMENT` (N m), or 0."""
     pose = root.findtext(".//inertial/pose") or "0 0"
     x, y, *_ = map(float, pose.split())
     lever = (x - grasp.x) * math.cos(grasp.theta) + (y - grasp.y) * math.sin(grasp.theta)

@@ -196,7 +196,7 @@ def plate(
 ) -> Shape:
     """Makes a plate between two heights, with its outer edges bevelled at 45 degrees.
 
-    Holes have plain edges, and the hulls ignore them. There is one hull for the part of the profile
+    Holes are not bevelled, and the hulls cover them. There is one hull for the part of the profile
     in each of `cells`. Without cells, there is one for each triangle of a triangulation.
     """
     if isinstance(profile, np.ndarray):
@@ -212,14 +212,14 @@ def plate(
 def _bevelled(profile: CrossSection, z_low: float, z_high: float, bevel: float) -> Manifold:
     """Makes the solid of a bevelled plate.
 
-    The outline after the inset may have other vertices or loops than the outline before it. So the
-    strip between the two is triangulated in the plane and then lifted.
+    The inset outline may have other vertices or loops than the original one. So the strip between
+    the two is triangulated in the plane and then lifted.
     """
     outer = profile.to_polygons()
     inner = profile.offset(-bevel, JoinType.Miter).to_polygons()
     rim, top = np.vstack(outer), np.vstack(inner)
     strip = manifold3d.triangulate([*outer, *(loop[::-1] for loop in inner)])
-    # The strip lists the inner loops backward, so number their vertices as in the cap.
+    # The strip was made from reversed inner loops: number their vertices as in the cap instead.
     numbers = np.arange(len(top))
     starts = np.cumsum([len(loop) for loop in inner])[:-1]
     backward = np.concatenate([n[::-1] for n in np.split(numbers, starts)])
@@ -251,7 +251,7 @@ def _plate_hulls(
     bevel: float,
     cells: Sequence[CrossSection],
 ) -> list[np.ndarray]:
-    """Makes prisms over the cells or triangles of a profile; only the profile's rim is bevelled."""
+    """Makes prisms over the cells or triangles of a profile, whose lower outer edge is bevelled."""
     coarse = profile.simplify(0.08)
     loops = coarse.to_polygons()
     points = np.vstack(loops)

@@ -14,7 +14,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 Array = NDArray[np.float64]
 
-# The largest angle between the normals of triangles of the hull that belong to one facet.
+# Triangles of the hull form one facet if their unit normals, rounded to this step, are equal.
 _COPLANAR = 1e-3
 
 

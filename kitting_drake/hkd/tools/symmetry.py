@@ -1,7 +1,7 @@
 """Rotational symmetry of tools about z.
 
 A tool is symmetric if its rotated copy has nearly the same surface and nearly the same outline. The
-rotated tool then fits the same cavity, and counts as placed in the same way.
+rotated tool then fits the same cavity, and its pose there counts as correct, too.
 """
 
 from collections.abc import Callable
@@ -55,7 +55,7 @@ class Difference:
     surface_distance_mm: float
     """The symmetric mean distance of the surfaces in mm; infinity if the outlines differ too much.
 
-    Unless the comparison is complete, a value above the limit is only a lower bound.
+    Unless the comparison is complete, a value above `MOST_SURFACE_DISTANCE_MM` is a lower bound.
     """
 
     @property
@@ -68,8 +68,8 @@ class Difference:
 
 
 def symmetry_order(triangles: NDArray[np.float64]) -> int:
-    """Returns the order of a tool's rotational symmetry about z: the largest of `ORDERS` that
-    holds, or 1.
+    """Returns the order of a tool's rotational symmetry about z: the largest of `ORDERS` for which
+    it is symmetric, or 1.
 
     Args:
         triangles: (n, 3, 3) the surface in frame T, in metres.
