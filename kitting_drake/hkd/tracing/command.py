@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from kitting_drake.hkd.tracing.tracer import TracedTool
 
 _OUTLINE_ERROR_MM = 0.8
-"""`Tool.outline_error` of a traced tool, in mm. Almost everywhere on an outline without reported
-doubts, the real tool extends beyond the outline by less than this. Cavities are wider by this."""
+"""`Tool.outline_error` of a traced tool, in mm. If no doubts are reported, the real tool extends
+less than this beyond its outline almost everywhere. Small clearances are increased by this."""
 
 
 def describe_trace(tracer: argparse.ArgumentParser) -> None:

@@ -15,10 +15,10 @@ _KINDS = ("add", "remove", "sheet")
 
 @dataclass(frozen=True)
 class Corrections:
-    """Polygons to add to and remove from the traced area, in order, and the sheet's corners."""
+    """Polygons to add to and remove from the traced region, in order, and the sheet's corners."""
 
     steps: tuple[tuple[str, NDArray[np.float64]], ...] = ()
-    """Pairs of `add` or `remove`, and a polygon (n, 2) in the mm of the rulers of `trace.png`."""
+    """Pairs of `add` or `remove`, and a polygon (n, 2) in mm, as on the rulers of `trace.png`."""
     corners: NDArray[np.float64] | None = None
     """The sheet's corners (4, 2) in pixels of the photo, counter-clockwise in the picture. None:
     the corners are found automatically."""
@@ -32,7 +32,7 @@ class Corrections:
         )
 
     def applied(self, area: CrossSection) -> CrossSection:
-        """Returns an area with the polygons added and removed."""
+        """Returns a region with the polygons added and removed."""
         for kind, points in self.steps:
             polygon = CrossSection([points], FillRule.EvenOdd)
             area = area + polygon if kind == "add" else area - polygon

@@ -14,7 +14,7 @@ from kitting_drake.common.errors import UserError
 
 _DIAGONAL_35MM = math.hypot(36, 24)
 ASSUMED_FOCAL_35MM = 26.0
-"""The 35 mm equivalent focal length of most phones' main lens, which is 24 to 28 mm."""
+"""The assumed 35 mm equivalent focal length of a phone; most main lenses have 24 to 28 mm."""
 _LEAST_SIDE = 500
 _MOST_PIXELS = 110_000_000
 

@@ -20,7 +20,7 @@ from kitting_drake.hkd.tracing.sheet_plane import GroundPlane
 Array = NDArray[np.float64]
 
 _COIN_MM = 2.0
-"""The assumed height of a coin, in mm."""
+"""The assumed thickness of a coin or disc, in mm."""
 _MOST_TILT = math.radians(10)
 """The largest tilt of a circle, in radians, at which it is still found as a disc."""
 _MARGIN_MM = 3.0
@@ -56,7 +56,7 @@ def plane_of_scale(cv2: Any, photo: Photo, scale: Scale, camera_mm: float | None
         camera_mm: the camera's height above the plane in mm; None: computed from the focal length.
 
     Raises:
-        UserError: the object is not visible, or there are several, or the flags are wrong.
+        UserError: the object is not visible, or there are several, or a flag has a wrong value.
     """
     if scale.board is not None:
         return _by_board(cv2, photo, scale, camera_mm)

@@ -14,7 +14,7 @@ _LEAST_SHARE = 0.04
 """The least share of the photo's area that a sheet covers."""
 _SAMPLES = 400
 _LEAST_SUPPORT = 0.4
-"""The least share of each edge that must be visible."""
+"""At least this share of each edge must be visible."""
 _REACHES = ((0.012, 0.005), (0.05, 0.012, 0.005))
 """The distances from a rough edge within which the true edge is sought.
 
@@ -24,7 +24,7 @@ one after the other. The second row begins with a larger distance, for an edge t
 _CLOSE_PX = 2.5
 """The distance in pixels up to which a point counts as on a line."""
 _SAME_QUAD = 0.02
-"""Quadrilaterals whose corners differ by less than this share of `_SMALL_SIDE` count as one."""
+"""Quadrilaterals count as one if their corners differ by less than this share of `_SMALL_SIDE`."""
 
 
 @dataclass(frozen=True)

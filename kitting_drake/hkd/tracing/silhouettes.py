@@ -46,7 +46,7 @@ def find_silhouettes(
     hidden: tuple[Array, ...],
     height: float | None = None,
 ) -> tuple[CrossSection, float, list[Unclear]]:
-    """Finds the area that tools cover.
+    """Finds the region that tools cover.
 
     Args:
         cv2: OpenCV.
@@ -57,7 +57,7 @@ def find_silhouettes(
         height: the height of the lowest tool, in mm; None: unknown.
 
     Returns:
-        The area in mm, the width of the blur of its border in mm, and the unclear regions, the
+        The region, in mm; the width of the blur of its border, in mm; and the unclear regions, the
         largest first.
 
     Raises:
@@ -131,7 +131,7 @@ def _polygon(cv2: Any, photo: RectifiedPhoto, polygon: Array) -> Array:
 
 
 def _cleaned(area: CrossSection) -> CrossSection:
-    """Removes specks and tiny holes from an area."""
+    """Removes specks and tiny holes from a region."""
     result = CrossSection()
     for part in area.decompose():
         loops = [np.asarray(loop) for loop in part.to_polygons()]
@@ -154,9 +154,9 @@ def _blur_mm(cv2: Any, soft: Array, mask: Array, ppm: float) -> float:
 _BAND_MM = 0.7
 """The largest distance of the true outline from the edge of the mask, in mm."""
 _SKIP_MM = 0.35
-"""The least distance from the edge at which colours are sampled, in mm."""
+"""The least distance from the edge of the mask at which colours are sampled, in mm."""
 _NEAR_MM = 0.8
-"""The approximate radius, in mm, of the area over which these colours are averaged."""
+"""The approximate radius, in mm, over which the sampled colours are averaged."""
 _LEAST_CONTRAST = 0.03
 
 
@@ -222,7 +222,7 @@ def _spread_colour(cv2: Any, light: Array, where: Array, ppm: float) -> Array:
 
 
 def contours(photo: RectifiedPhoto, soft: Array) -> CrossSection:
-    """Returns the area in mm in which a soft mask (rows, columns) exceeds one half."""
+    """Returns the region, in mm, in which a soft mask (rows, columns) exceeds one half."""
     import contourpy
 
     padded = np.pad(soft, 1)

@@ -25,7 +25,7 @@ def outline_of_silhouette(
     tool are at height t / 2 on all sides, so its silhouette is scaled only once.
 
     Args:
-        silhouette: the area that the tool hides in the plane.
+        silhouette: the part of the plane that the tool hides.
         camera: (3,) the camera's position.
         height: the tool's height t in mm, less than H.
         edges: one of `EDGES`.

@@ -21,7 +21,7 @@ _ROUGH = 0.022
 _MOST_FINE = 0.1
 _HOLE_BALL_MM = 0.6
 _STRIP_MM = 1.2
-"""Half the width above which a shaded region, eroded by `_HOLE_BALL_MM`, counts as wide, in mm."""
+"""Half the width, in mm, up to which an eroded region in `_shaded_holes` counts as a strip."""
 _EDGE_MM = 2.3
 """The distance by which the ground is extended over the rough pixels at an edge, in mm."""
 _SHINE_STEEP = 0.6
@@ -33,8 +33,8 @@ _SHINY, _SHINY_SHARE = 0.06, 0.25
 the ground by more than `_SHINY`, in logarithms of light."""
 _SHINE_REACH_MM = 3.0
 _GLARE, _GLARE_SPREADS = 0.025, 5.0
-"""The least brightness of glare above the ground, in logarithms of light and in standard deviations
-of the ground's light."""
+"""The least brightness of glare above the ground: in logarithms of light, and in standard
+deviations of the ground's light. The larger one counts."""
 _GLARE_REACH_MM, _GLARE_GAP_MM, _GLARE_MM2, _GLARE_SHARE = 8.0, 2.5, 0.7, 0.25
 """The largest distance of glare from the rest of its tool; half the largest width of the strip
 between them; the least area of an added region; and the least share of this region that must be
@@ -45,7 +45,7 @@ _BLENDED_MM, _SHADED = 1.2, 0.06
 """The width of a step of light, in mm, above which a tool blends into its surroundings; and the
 least darkness of a shadow, in logarithms of light."""
 _NEUTRAL = 0.05
-"""The largest difference in colour of ground in shadow, in logarithms of light."""
+"""The largest difference in colour between shaded and lit ground, in logarithms of light."""
 _LARGEST_HOLE_MM2 = 500.0
 """The area in mm^2 above which a hole must show ground that is not in shadow."""
 _UNLIKE_SHARE = 0.3
@@ -64,8 +64,8 @@ class ShadowLook:
     rough: float
     """The largest ratio of a shadow's roughness to that of the plain ground."""
     shine: float
-    """A bay or hole is a reflection if the step of light is wider than this, in mm, on 30 % of its
-    border with the tool."""
+    """A bay or hole is a reflection if the step of light is wider than this, in mm, on at least
+    30 % of its border with the tool."""
 
 
 CAREFUL = ShadowLook(0.3, 2.0, 1.2)
@@ -162,9 +162,9 @@ class ToolMasks:
         return self._bordered(self._with_glare(self._without_shine(tool, widest)))
 
     def shine(self, mask: Array) -> Array:
-        """Returns a mask (rows, columns): 1 for the pixels beside a given mask that are too bright.
+        """Returns a mask (rows, columns): 1 for bright pixels beside a given mask.
 
-        The ground is not as bright, so these pixels are probably reflections on a tool.
+        They are clearly brighter than the ground, so they are probably reflections on a tool.
         """
         cv2 = self._cv2
         near = cv2.dilate(mask, _disc(cv2, _SHINE_REACH_MM * self._px_per_mm))

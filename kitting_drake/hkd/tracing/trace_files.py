@@ -79,7 +79,7 @@ def trace_png(
     Args:
         cv2: OpenCV.
         photo: the plane from above.
-        silhouette: the area that the tools hide, in mm.
+        silhouette: the part of the plane that the tools hide, in mm.
         outlines: the outline of each tool by its name, in mm.
         doubts: places, in mm, where an outline may be wrong.
         caption: a line above the picture.

@@ -33,7 +33,7 @@ _STEEPEST = math.radians(30)
 _MOST_PX_PER_MM = 5.0
 _MOST_PIXELS = 4e6
 _BLURRED_MM = 1.6
-"""The width of edges, in mm, above which a photo counts as blurred."""
+"""The width of the edges' blur, in mm, above which a photo counts as blurred."""
 _HEIGHTS_MM = (0.5, 100.0)
 _CAMERAS_MM = (100.0, 3000.0)
 _SHARE_OF_HEIGHT = 0.5
