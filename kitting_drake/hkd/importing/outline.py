@@ -84,7 +84,7 @@ def laid_along_x(
         name: the outline's name in messages.
 
     Raises:
-        UserError: `length_mm` is None and the outline's length is not that of a tool.
+        UserError: `length_mm` is None and the outline is too short or too long for a tool.
     """
     x_min, y_min, x_max, y_max = outline.bounds()
     nominal = NOMINAL_MM / max(x_max - x_min, y_max - y_min)

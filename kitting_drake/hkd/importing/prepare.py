@@ -111,8 +111,8 @@ def _prepare(request: ImportRequest, name: str, directory: Path, say: Say) -> Pr
     if drawn:
         if tipping_deg(solid) < _TIPS_DEG:
             raise UserError(
-                f"the tool is {request.height_mm:g} mm high and would tip over: draw it from "
-                "above, as it lies at rest"
+                f"the tool is {request.height_mm:g} mm high and would tip over: draw it as it "
+                "lies at rest, seen from above, or check --height_mm"
             )
         assumed = (
             f"an outline of {' x '.join(f'{side / nominal:.1f}' for side in size(solid)[:2])} mm "

@@ -251,8 +251,8 @@ def _pruned(hulls: list[np.ndarray], tolerance: float) -> list[np.ndarray]:
 def _grow(
     seed: int, hulls: list[_Hull], allowed: CrossSection, tolerance: float
 ) -> tuple[np.ndarray, set[int]]:
-    """Grows the largest allowed hull from a seed; returns its points and the indices of its
-    members."""
+    """Grows the largest allowed hull from a seed; returns its points and the indices of the hulls
+    merged into it."""
     current, members = hulls[seed], {seed}
     candidates = set(range(len(hulls))) - members
     while True:

@@ -24,7 +24,7 @@ class Corrections:
     the corners are found automatically."""
 
     def settles(self, place: tuple[float, float]) -> bool:
-        """Whether a place (x, y), in mm, lies in a polygon, so that the user has checked it."""
+        """Whether the user has checked a place (x, y), in mm: it lies in one of the polygons."""
         spot = CrossSection.square((0.1, 0.1), True).translate(place)
         return any(
             not (CrossSection([points], FillRule.EvenOdd) ^ spot).is_empty()

@@ -239,10 +239,10 @@ def _edge(
 
 
 def _robust_line(shares: Array, offsets: Array) -> tuple[Array, Array]:
-    """Fits a line to most of the points, and ignores outliers.
+    """Fits a line to most of the points (share, offset), and ignores outliers.
 
     Returns:
-        The (offset, slope) of the line, and a mask (n) of the points that are close to it.
+        The line's offset at share 0 and its slope; and a mask (n) of the points close to it.
     """
     rng = np.random.default_rng(0)
     design = np.c_[np.ones_like(shares), shares]

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 Array = NDArray[Any]
 
 _DARKER, _BRIGHTER, _COLOURED = 0.22, 0.12, 0.11
-"""The least differences from the ground, in logarithms of light, that may be a tool: darker,
-brighter, or of another colour."""
+"""A pixel may be a tool if it is darker or brighter than the ground, or of another colour, by at
+least this, in logarithms of light."""
 _NO_SHADOW = 1.3
 """The largest darkening by a shadow, in logarithms of light."""
 _BALL_MM = 0.9
@@ -36,9 +36,9 @@ _GLARE, _GLARE_SPREADS = 0.025, 5.0
 """The least brightness of glare above the ground: in logarithms of light, and in standard
 deviations of the ground's light. The larger one counts."""
 _GLARE_REACH_MM, _GLARE_GAP_MM, _GLARE_MM2, _GLARE_SHARE = 8.0, 2.5, 0.7, 0.25
-"""The largest distance of glare from the rest of its tool; half the largest width of the strip
-between them; the least area of an added region; and the least share of this region that must be
-brighter than the ground."""
+"""In mm: the largest distance of glare from the rest of its tool, and half the largest width of the
+strip between them. In mm^2: the least area of an added region. As a share: the least part of this
+region that must be brighter than the ground."""
 _BAY_MM = 12.0
 """Half the largest width, in mm, of the bays and holes that may be reflections."""
 _BLENDED_MM, _SHADED = 1.2, 0.06
@@ -49,7 +49,7 @@ _NEUTRAL = 0.05
 _LARGEST_HOLE_MM2 = 500.0
 """The area in mm^2 above which a hole must show ground that is not in shadow."""
 _UNLIKE_SHARE = 0.3
-"""The least share of a tool's pixels that differ from the ground."""
+"""At least this share of a tool's pixels differs from the ground."""
 _LEAST_AREA_MM2 = 40.0
 _LEAST_HOLE_MM2 = 4.0
 _LEAST_HOLE_RADIUS_MM = 0.7

@@ -51,9 +51,8 @@ def read_stl(path: Path) -> NDArray[np.float64]:
 def _is_text(data: bytes) -> bool:
     """Whether an STL is text.
 
-    The first word does not decide it, because a binary file may also start with `solid`. But the
-    count of triangles in a binary file is less than 2**24, so it has a zero byte, which text never
-    has.
+    The first word does not decide it, because a binary file may also start with `solid`. But a
+    binary file has a zero byte, because its count of triangles is below 2**24; text has none.
     """
     return b"\0" not in data[:_HEADER] and re.search(rb"vertex\s", data, re.IGNORECASE) is not None
 

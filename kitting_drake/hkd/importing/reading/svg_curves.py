@@ -147,7 +147,7 @@ def _paper(sides: list[float]) -> tuple[str, float]:
         sides: the page's sides in units, the shorter first.
 
     Returns:
-        A phrase that names the sheet and the unit, and the unit's length in mm. If there is none,
+        A phrase that names the sheet and the unit, and the unit's length in mm. If no sheet fits,
         "" and 1.
     """
     for paper, short, long in PAPERS_MM:
