@@ -41,8 +41,8 @@ def draw_decision(observation: Observation, decision: Decision, *, title: str = 
     Args:
         observation: the observation on which the decision is based.
         decision: the decision of a learned policy.
-        title: the title of the picture; empty for the kind of action with its log-odds, if the
-            networks predict them.
+        title: the title of the picture. If it is empty, the title is the kind of action, with its
+            log-odds if the networks predict them.
 
     Returns:
         The picture as PNG.
@@ -69,7 +69,7 @@ def draw_action(observation: Observation, action: PickPlaceAction, *, title: str
     Args:
         observation: the observation on which the decision is based.
         action: the decision.
-        title: the title of the picture; empty for the kind of action.
+        title: the title of the picture. If it is empty, the title is the kind of action.
 
     Returns:
         The picture as PNG.

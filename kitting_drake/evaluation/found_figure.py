@@ -32,7 +32,7 @@ def draw_found(
     """Draws colour and height from above, with the outlines of workspace and region.
 
     Args:
-        observation: the heightmap of all of the table that the cameras see.
+        observation: the heightmap of the whole visible table.
         workspace: the proposed pixel grid of o_t.
         region: corners (x, y) of the region of interest in the robot's base frame, in metres.
         ignore: polygons, in the same frame, whose content is ignored.
@@ -130,7 +130,11 @@ def _legend(ignored: bool) -> list[Line2D | Patch]:
 def _without_gaps(
     image: NDArray[np.float32], seen: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Fills pixels (channels, rows, cols) between a camera's samples from their neighbours."""
+    """Fills the pixels between a camera's samples with the means of their neighbours.
+
+    Returns:
+        The filled image (channels, rows, cols), and the mask (rows, cols) of its known pixels.
+    """
     share = ndimage.uniform_filter(seen.astype(np.float32), 3)
     means = np.stack([ndimage.uniform_filter(np.where(seen, one, 0), 3) for one in image])
     filled = np.where(seen, image, means / np.maximum(share, 1e-6))

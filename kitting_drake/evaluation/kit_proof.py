@@ -152,8 +152,8 @@ def prove_kit(
     """Lets a policy fill a kit in simulation, and writes `proof.html` and `proof.json` into its
     folder.
 
-    The policy is that of the kit's scenario. In each episode the tools lie elsewhere, and all
-    cavities are wider or narrower by a common random error with the standard deviation
+    The policy is that of the kit's scenario. In each episode the tools lie at other poses, and
+    all cavities are wider or narrower by a common random error with the standard deviation
     `TOLERANCE_MM`. A kit that does not fit is tried again with wider cavities, if these may mend
     its failures. If a clearance certainly does not fit, its remaining episodes are left out.
 
@@ -249,7 +249,7 @@ def _prove(
 
 
 def _drawn_kit(seed: int, clearance_mm: float, clearance_of: Mapping[str, float]) -> dict[str, Any]:
-    """Draws the clearances of an episode, as fields of a scenario's `kit`."""
+    """Draws random clearances for an episode, as fields of a scenario's `kit`."""
     error = float(np.random.default_rng([seed, 23]).normal(0.0, TOLERANCE_MM))
     drawn = {
         name: round(max(value + 1e-3 * error, 0.0), 6)

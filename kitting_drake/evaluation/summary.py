@@ -19,12 +19,12 @@ Entry = dict[str, Any]
 """An object or an action in the result of an episode."""
 
 FAILED = "failed episode"
-"""The cause of all objects of an episode that an error ended."""
+"""The cause of failure of all objects of an episode that ended with an error."""
 TIMED_OUT = "timed out"
-"""The cause of all objects of an episode that the time limit ended."""
+"""The cause of failure of all objects of an episode that reached the time limit."""
 
 UNKNOWN = "unknown"
-"""If no episode has objects, a failed episode counts as one object of this category."""
+"""If no episode lists its objects, a failed episode counts as one object of this category."""
 
 AMBIGUITIES = {
     "protruding": ("height_error_mm", 1e3 * STRICT_HEIGHT),
@@ -180,8 +180,8 @@ def counted_objects(episodes: Sequence[Episode]) -> list[list[Entry]]:
     """The objects of each episode that count: those for which a goal was left.
 
     In a failed or timed-out episode no object is a success or has errors. If the episode's process
-    died, the names of its objects may be unknown. For each category, such an episode gets as many
-    failed objects as the episode with the most of them.
+    died, its objects may be unknown. Such an episode gets, in each category, the largest number of
+    objects that any episode has in this category; all of them count as failed.
     """
     found = [
         [item for item in episode["objects"] if item["add_s_mm"] is not None]

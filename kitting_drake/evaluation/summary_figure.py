@@ -153,7 +153,7 @@ def _draw_shares(
     look: _Look,
     label: str,
 ) -> None:
-    """Draws the share of errors with a magnitude of at most x; None counts as infinite."""
+    """Draws, over x, the share of errors with a magnitude of at most x; None counts as infinite."""
     known = [error for error in errors if error is not None]
     ordered = np.sort(np.clip(np.abs(known), *limits))
     shares = np.arange(len(known) + 1) / max(len(errors), 1)

@@ -116,8 +116,8 @@ def _print_measures(console: Console, result: EpisodeResult) -> None:
 
 
 def summary_table(summary: dict[str, Any]) -> Table:
-    """The table of a summary, with a row for each category. `strict` and `success` count
-    objects."""
+    """The table of a summary, with a row for each category. The columns `strict` and
+    `success` count objects."""
     table = Table(title=_summary_title(summary), title_justify="left")
     table.add_column("category", no_wrap=True)
     for heading in ("strict", "success", "ADD-S mm", "95 %", *_ERROR_HEADINGS[1:]):

@@ -5,7 +5,7 @@ The server listens on 127.0.0.1 only. It answers these requests in HTML, JSON or
 - `GET /`: the page, one file of HTML and JavaScript.
 - `GET /steps`: the grid, the jaws, and the name and action of each step.
 - `GET /steps/N/color.png` and `height.png`: o_t, with one image pixel per grid pixel.
-- `POST /steps/N` with the content of an `action.json`: writes it to the folder of the frames.
+- `POST /steps/N` with the content of an `action.json`: writes it to the folder of step N.
 
 An error is answered with the status 400, 403 or 404, and with a sentence in `{"error": ...}`.
 """

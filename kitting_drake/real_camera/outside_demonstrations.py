@@ -34,8 +34,7 @@ from kitting_drake.real_camera.step_actions import StepAction, read_action
 from systems.signals import Observation
 
 TASK = "bench"
-"""The task name in the origin of demonstrations from real cameras; simulated ones have other
-names."""
+"""The task name in files of demonstrations from real cameras. No simulated task has this name."""
 _FIRST_SEED = VALIDATION_SEEDS.stop
 """The first seed above those of all simulated episodes."""
 
@@ -207,8 +206,8 @@ def _labelled(
         labelled.append((step, action))
     if labelled[0][1].action.stop:
         raise UserError(
-            f"{steps[0].path.parent} has only a last step, in which nothing is left to do: there "
-            "is nothing to learn from it"
+            f"{steps[0].path.parent} has only a last step, in which nothing is left to do: remove "
+            "this demonstration, from which there is nothing to learn"
         )
     return labelled
 

@@ -196,7 +196,7 @@ def read_calibration(
         # A file of another tool may describe a whole camera.
         content = lens_of_mapping(content, str(path))
         entries = {str(content.get("camera_name", "camera")): content}
-        # In a file with one camera, the fields for all cameras are beside those of the camera.
+        # A file with one camera mixes the camera's fields with those that all cameras share.
         beside = (*_BENCH_FIELDS, "camera_name")
     cameras = tuple(
         _read_camera(path, str(name), node, beside, poses) for name, node in entries.items()

@@ -29,7 +29,7 @@ _THIN_PRISM = 8
 _TILT = 12
 """The number of coefficients in OpenCV's list before those of a tilted sensor."""
 _UNDONE = 1e-4
-"""The largest error, at depth 1, of a ray that is undistorted and then distorted again."""
+"""The largest accepted error, at depth 1, of a ray that is undistorted and then distorted again."""
 _WIDEST = np.deg2rad(85)
 """The largest angle of a ray from the optical axis, in radians."""
 

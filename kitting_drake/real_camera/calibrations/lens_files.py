@@ -34,8 +34,8 @@ def read_lens_file(path: Path, stream: str, resolution: tuple[int, int] | None) 
 
     Args:
         path: the file, or a recording with a CameraInfo.
-        stream: the lens to take if there are several: kalibr's cam1, RealSense's Color, or a topic.
-            The camera's name may also be given; it is used only if it matches a lens.
+        stream: the lens to take if there are several, for example kalibr's cam1, RealSense's Color,
+            or a topic. The camera's name may also be given; it is used only if it matches a lens.
         resolution: the (width, height) of a RealSense stream, in pixels; None if the file has the
             stream in only one resolution.
 
@@ -62,7 +62,8 @@ def lens_of_mapping(content: dict[str, Any], where: str, stream: str = "") -> di
     A mapping that is not in the layout of another tool is returned unchanged.
 
     Raises:
-        UserError: the layout has several lenses, or a lens without a pinhole model.
+        UserError: `stream` does not select one of several lenses, or the lens is not a pinhole, or
+            a field is missing or invalid.
     """
     if kalibr_cameras(content):
         return _kalibr(content, where, stream)
@@ -70,7 +71,7 @@ def lens_of_mapping(content: dict[str, Any], where: str, stream: str = "") -> di
         parameters = content.get("parameters")
         if not isinstance(parameters, list) or len(parameters) != 1:
             raise UserError(
-                f"{where} has cameras at several times: save the parameters of one time"
+                f"{where} must have the parameters of exactly one view: save a single view"
             )
         content = parameters[0]
     if "intrinsic" in content or "intrinsic_matrix" in content:
@@ -141,7 +142,7 @@ def _kalibr(content: dict[str, Any], where: str, stream: str) -> dict[str, Any]:
 def _open3d(content: dict[str, Any], where: str) -> dict[str, Any]:
     """Converts the intrinsics of Open3D to our own layout.
 
-    Open3D writes them as PinholeCameraIntrinsic, as PinholeCameraParameters, or by its recorders.
+    The mapping is a PinholeCameraIntrinsic, a PinholeCameraParameters, or from Open3D's recorders.
     """
     inner = content.get("intrinsic", content)
     if not isinstance(inner, dict):

@@ -124,7 +124,7 @@ def _poses_of_mapping(content: dict[str, Any], where: str) -> list[FoundPose]:
     parameters = content.get("parameters")
     if content.get("class_name") == "PinholeCameraTrajectory":
         if not isinstance(parameters, list) or len(parameters) != 1:
-            raise UserError(f"{where} has poses at several times: save the parameters of one time")
+            raise UserError(f"{where} must have exactly one pose: save the parameters of one view")
         content = parameters[0] if isinstance(parameters[0], dict) else {}
     if "extrinsic" in content:
         return [FoundPose(open3d_pose(content, where), where)]

@@ -1,5 +1,5 @@
-"""Reads poses in calls of ROS's static_transform_publisher, such as MoveIt's hand-eye
-calibration."""
+"""Reads poses in calls of ROS's static_transform_publisher, which MoveIt's hand-eye calibration
+writes, for example."""
 
 from __future__ import annotations
 

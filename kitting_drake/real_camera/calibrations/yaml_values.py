@@ -112,7 +112,7 @@ def number(value: Any, where: str) -> float:
 
 
 def whole_number(value: Any, where: str) -> int:
-    """Returns a value as a whole number of 1 or more.
+    """Returns a value as a whole number that is at least 1.
 
     Raises:
         UserError: the value is something else. The message names the field.
@@ -146,7 +146,7 @@ def matrix(value: Any, rows: int, cols: int, where: str) -> Array:
     """Returns a value as an array of finite numbers with the shape (rows, cols); see `numbers`.
 
     Raises:
-        UserError: the value has more or fewer numbers.
+        UserError: the value does not hold rows * cols finite numbers.
     """
     flat = numbers(value, where)
     if flat.size != rows * cols:

@@ -45,8 +45,8 @@ class TableCheck:
     noise: float
     """A robust estimate of the standard deviation of the heights, in metres."""
     holes: float
-    """The share, from 0 to 1, of the table without depth: of the part in view for one camera, and
-    of the whole table for o_t."""
+    """The share of the table without measured depth, from 0 to 1. For one camera only the part in
+    its view counts, for o_t the whole table."""
 
     @property
     def tilt_angle(self) -> float:

@@ -168,7 +168,10 @@ def _rotation(angle: float) -> Array:
 
 
 def _least_rectangle(points: Array) -> Array:
-    """Returns the directions (2, 2), as columns, of the smallest rectangle around points (n, 2)."""
+    """Returns the directions of the sides of the smallest rectangle around points (n, 2).
+
+    They are the columns of a matrix (2, 2).
+    """
     corners = points[ConvexHull(points).vertices]
     edges = np.diff(corners, axis=0, append=corners[:1])
     candidates = [_rotation(angle) for angle in np.arctan2(edges[:, 1], edges[:, 0])]

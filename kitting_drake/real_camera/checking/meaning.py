@@ -124,7 +124,7 @@ def _of_table(
     high = "high" if table.bias > 0 else "low"
     bias = f"grasps and rims look {1e3 * abs(table.bias):.1f} mm too {high}"
     if table.bias > floor:
-        # The hand stops this far above `table_height`, whatever the cameras measure.
+        # The hand stops at the height `floor` above `table_height`, whatever the cameras measure.
         into = f"{1e3 * (table.bias - floor):.1f} mm"
         bias += f"; if table_height is too low, fingertips may go {into} into the table"
     if table.noise <= _CLEAN:
@@ -191,7 +191,7 @@ def _of_block(who: str, seen: SeenBlock, block: Block) -> list[Finding]:
 
 
 def scales(seen: SeenBlock, block: Block) -> tuple[float, float, float]:
-    """Returns the apparent length, width and height of a block, as shares of the true ones."""
+    """Returns the apparent length, width and height of a block, divided by the true ones."""
     length, width, height = np.divide(seen.size, block.size).tolist()
     return length, width, height
 
@@ -206,6 +206,6 @@ def offset(seen: SeenBlock, block: Block) -> tuple[float, float, float] | None:
 
 
 def _verdict(error: float) -> str:
-    """Returns the verdict on an error in metres, by its share of the clearance."""
+    """Returns the verdict on an error in metres, by its ratio to the clearance."""
     share = abs(error) / CLEARANCE
     return GOOD if share < 0.25 else TIGHT if share < 0.75 else BAD

@@ -34,7 +34,7 @@ _WARNED_OFF = 0.005
 _WARNED_TILT = math.radians(0.65)
 """The largest tilt of the table, in radians, without a warning."""
 _STEP = 4
-"""The step between the rows and columns of an image that are used."""
+"""Of an image, only the rows and columns at multiples of this are used."""
 _FARTHEST = 0.35
 """The distance from the table's height within which planes are searched, in metres."""
 _LEAST = 150
@@ -47,7 +47,7 @@ _ABOVE = 0.08
 pixels of any plane above it. The share is small, because objects may hide most of a table."""
 _CURVED = 0.5
 """The depths are probably distances from the camera if their conversion to depths along the optical
-axis reduces the table's noise to less than this share."""
+axis reduces the table's noise to less than this fraction of its value."""
 _FLAT = 0.0005
 """The noise below which a table counts as flat, in metres."""
 

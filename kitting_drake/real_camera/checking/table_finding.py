@@ -37,7 +37,7 @@ _TILTED = math.radians(10)
 MOST_TILT = math.radians(1.3)
 """The largest tilt of a table, in radians, that `decide` accepts."""
 _STEP = 2
-"""The step between the rows and columns of an image that are used."""
+"""Of an image, only the rows and columns at multiples of this are used."""
 _REACH = 2.0
 """The largest distance of the table from the robot's base along x and y, in metres."""
 _LEAST_SHARE = 0.1
@@ -70,8 +70,8 @@ _AROUND = 0.02
 _TOO_NEAR = 0.25
 """The distance from the middle of an arm's base within which it cannot pick, in metres."""
 _ENOUGH = 0.6
-"""A workspace farther from the base than `_TOO_NEAR` is chosen if it holds more than this share of
-the table area that any workspace can hold."""
+"""A workspace farther from the base than `_TOO_NEAR` is preferred if it holds more than this share
+of the largest table area that a workspace can hold."""
 _NEARLY = 0.97
 """Workspaces count as equally good if they hold at least this share of the table area of the best
 one. The nearest of them is chosen."""
@@ -212,7 +212,7 @@ def _extent(points: Array, plane: Plane, grid: PixelGrid) -> tuple[Mask, Mask]:
     table = ndimage.binary_closing(near | thick, disc(_cells(_CLOSED)))
     table = ndimage.binary_fill_holes(largest_part(table))
     labels, count = ndimage.label(ndimage.binary_dilation(tall, disc(_cells(_AROUND))))
-    # Ignore only the tall things that stand on the table or at its edge.
+    # Keep only the tall things that stand on the table or at its edge.
     on_table = np.isin(np.arange(count + 1), labels[table])
     on_table[0] = False
     return largest_part(table), np.asarray(on_table[labels])
@@ -260,8 +260,8 @@ def _workspace(table: Mask, grid: PixelGrid) -> tuple[PixelGrid, str]:
 def _best_centre(table: Mask, grid: PixelGrid, size: Array, centre: Array, fits: Mask) -> Array:
     """Returns the centre (2,) of the best window, in metres.
 
-    Among the windows with nearly the largest table area, it is the nearest to the base. Windows
-    that are too near the base are chosen only if the others have much less table area. Along an
+    The best window is the nearest to the base among those with nearly the largest table area. A
+    window too near the base is chosen only if all others have much less table area. Along an
     axis on which the whole table fits, the window's centre is `centre`.
     """
     window = np.rint(size / _CELL).astype(int)

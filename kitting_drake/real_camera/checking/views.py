@@ -116,9 +116,9 @@ def seen_share(observation: Observation) -> float:
 def _in_view(
     camera: BenchCamera, X_BC: Array, grid: PixelGrid, step: int = _STEP
 ) -> NDArray[np.bool_]:
-    """Whether each pixel (n,) of the workspace is in the camera's image, at the table's height.
+    """For each pixel (n,) of o_t, whether its point at the table's height is in the camera's image.
 
-    Only every `step`th row and column is computed.
+    Only every `step`th row and column of o_t is computed.
     """
     rows, cols = np.meshgrid(
         np.arange(0, grid.rows, step), np.arange(0, grid.cols, step), indexing="ij"
@@ -204,7 +204,7 @@ def _check_depth(frame: Frame, camera: BenchCamera, calibration: Calibration) ->
             "is 1 mm by default"
         )
     else:
-        return  # `check_table` gives a better hint.
+        return  # `check_table` explains other errors better.
     raise CalibrationError(f"{told}: {hint}")
 
 

@@ -231,7 +231,7 @@ def _find(folders: Sequence[Path], name: str, alone: bool) -> _Sources:
 
 
 def _only(existing: Sequence[Path], folders: Sequence[Path], name: str, number: int) -> Path:
-    """Returns the only existing file of a camera; raises UserError if there is none or another.
+    """Returns the only existing file of a camera; raises UserError if there are none or several.
 
     For the message, `number` is 0 for colour and 1 for depth.
     """

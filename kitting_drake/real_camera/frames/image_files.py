@@ -55,7 +55,7 @@ def read_color(path: Path) -> NDArray[np.uint8]:
         if image.mode in _DEPTH_MODES:
             bits = "32" if image.mode == "F" else "16"
             raise UserError(
-                f"{path} has {bits} bits per pixel, but colour has 8: is this the depth?"
+                f"{path} has {bits} bits per channel, but colour has 8: is this the depth?"
             )
         try:
             return np.asarray(image.convert("RGB"))

@@ -63,7 +63,7 @@ def calibrate_cameras(board: Board, paths: Sequence[Path], lenses: Calibration) 
 
     Raises:
         UserError: an image is missing, shows too little of the board or shows it too obliquely, or
-            its pose is ambiguous.
+            the camera's pose is ambiguous.
     """
     results, poses = [], {}
     for camera in lenses.cameras:
@@ -117,8 +117,8 @@ def _calibrate_camera(board: Board, paths: Sequence[Path], camera: BenchCamera) 
         alone = max(item.rms for item in singles)
         if fit.rms > alone + _MOVED:
             raise UserError(
-                f"{where}: one pose for all images is off by {fit.rms:.2f} pixels, one for each by "
-                f"at most {alone:.2f}: did the board or the camera move between them?"
+                f"{where}: a common pose for all images has an error of {fit.rms:.2f} pixels, but "
+                f"separate poses at most {alone:.2f}: did the board or the camera move in between?"
             )
     corners = sum(len(item.points) for item in seen)
     return CalibratedCamera(camera.name, images[0], seen[0], len(paths), corners, fit)

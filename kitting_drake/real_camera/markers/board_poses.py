@@ -28,11 +28,12 @@ _CLEARER = 16.0
 """A pose is ambiguous if another pose raises the sum of the corners' squared errors by less than
 this multiple of the variance of one corner."""
 _LIKELY = 0.2
-"""The error of corners that is expected in a real image, in pixels."""
+"""The least error of corners, in pixels, that is assumed in the test for ambiguous poses."""
 _NOISE = 0.05
-"""The error of corners in a good image, in pixels."""
+"""The least error of corners, in pixels, that is assumed for the error of the focal ratio."""
 _WORST = 3.0
-"""The error of corners, in pixels, above which the lens is another one or the board moved."""
+"""The error of corners, in pixels, above which the lens is probably another one, or the board
+moved."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,8 @@ def fit_board(points: Array, pixels: Array, lens: Intrinsics, where: str) -> Boa
         where: the beginning of error messages.
 
     Raises:
-        UserError: the corners do not fit or are seen too obliquely, or two poses explain them.
+        UserError: the corners do not fit, lie on a line or are seen too obliquely, or two poses
+            explain them equally well.
     """
     starts = _starts(points, pixels, lens, where)
     fits = sorted(

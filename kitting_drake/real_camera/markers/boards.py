@@ -31,7 +31,7 @@ _FIELDS = (
 )
 _CORNERS = ("bottom_left", "bottom_right", "top_left")
 _NEEDED = 12
-"""The least number of corners for a pose."""
+"""The least number of corners for a pose, or all corners of a board that has fewer."""
 _SHIFT = 0.42
 """The approximate shift of corners by OpenCV's refinement of AprilTags, in pixels."""
 _LEVEL = math.radians(3)
@@ -178,8 +178,8 @@ def find_corners(board: Board, image: NDArray[np.uint8], where: str) -> SeenBoar
     if total < needed:
         raise UserError(
             f"{where} shows {len(found)} of the board's {len(ids)} markers and {total} of its "
-            f"{board.count} corners, and {needed} are needed: check the board's description, the "
-            "light and the focus, and that the board is in view"
+            f"{board.count} corners, but a pose needs {needed} corners: check the board's "
+            "description, the light and the focus, and that the board is in view"
         )
     own = _in_own_frame(np.concatenate(points).astype(float), board.size[1])
     return SeenBoard(own, np.concatenate(pixels), len(found))

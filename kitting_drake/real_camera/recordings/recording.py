@@ -91,7 +91,7 @@ def camera_info_of(path: Path, stream: str) -> dict[str, Any]:
             is ignored.
 
     Raises:
-        UserError: there is no such topic, or several match.
+        UserError: there is no CameraInfo, or it is unclear which of several topics is meant.
     """
     with open_recording(path) as recording:
         topics = recording.topics(CAMERA_INFO)

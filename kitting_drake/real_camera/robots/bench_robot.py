@@ -53,7 +53,7 @@ class BenchRobot:
         return tuple(f"{self.model}_joint{number}" for number in range(1, JOINTS + 1))
 
     def as_dict(self) -> dict[str, Any]:
-        """Returns the content of the arm's file, without its rate."""
+        """Returns the content of the arm's file, without the field `rate`."""
         base = self.base
         record: dict[str, Any] = {
             "model": self.model,
@@ -105,8 +105,8 @@ def read_robot(path: Path) -> BenchRobot:
     x, y, z = matrix(content.get("base", [0, 0, 0]), 1, 3, f"{path}: base")[0].tolist()
     if max(abs(x), abs(y), abs(z)) > _FARTHEST:
         raise UserError(
-            f"{path}: base is ({x:g}, {y:g}, {z:g}), more than {_FARTHEST:g} m away: give it in "
-            "metres"
+            f"{path}: base is ({x:g}, {y:g}, {z:g}), but no coordinate may exceed {_FARTHEST:g} m: "
+            "give metres, not millimetres"
         )
     yaw = number(content.get("yaw_deg", 0), f"{path}: yaw_deg")
     home = joints = None

@@ -18,7 +18,7 @@ from kitting_drake.hkd.tools.toolsets import PAPER_SPLITS, toolsets
 
 
 def benchmark_kits(count: int | None, console: Console) -> dict[str, Any]:
-    """Builds the dataset's kits and measures them; times in seconds, lengths in millimetres.
+    """Builds the dataset's kits; returns their measurements, in seconds and millimetres.
 
     Args:
         count: the number of kits of each split; None for all.

@@ -53,8 +53,8 @@ def measure_reach(robot: BenchRobot, grid: PixelGrid, console: Console) -> dict[
         console: the console for the progress.
 
     Returns:
-        The content of `reach.json`, in m and degrees. Shares, from 0 to 1, are of all positions and
-        yaws of the hand.
+        The content of `reach.json`, in m and degrees. A share, from 0 to 1, is the fraction of the
+        hand's positions and yaws that the arm reaches.
     """
     heights = np.linspace(grid.z_min + _LOWEST, grid.z_max, _LEVELS)
     reach = ReachMap(robot.limits, heights - robot.base.z)
@@ -96,7 +96,7 @@ def _points(grid: PixelGrid, spacing: float) -> tuple[NDArray[np.float64], NDArr
 def _shares(
     reach: ReachMap, base: ArmBase, x: NDArray[np.float64], y: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Returns the share (x, y, heights) of the hand's yaws that the arm reaches."""
+    """Returns, at each point (x, y, height), the share of the hand's yaws that the arm reaches."""
     points = np.stack(np.meshgrid(x, y, indexing="ij"), -1)
     return reach.shares(base, points.reshape(-1, 2)).reshape(len(x), len(y), -1)
 
@@ -107,7 +107,8 @@ def _search(
     """Searches for the best base.
 
     Returns:
-        All bases that were tried, as x, y, yaw in degrees and share; and the best base.
+        All bases that were tried, each as x, y, yaw in degrees, and its share of reachable poses;
+        and the best base.
     """
     coarse, fine = _points(grid, _COARSE), _points(grid, _SPACING)
     tried: list[list[float]] = []
@@ -164,7 +165,7 @@ def _bases(given: ArmBase, grid: PixelGrid) -> list[ArmBase]:
 
 
 def reach_table(measured: dict[str, Any]) -> Table:
-    """Makes a table of the given base's reach, by height, and of the best base."""
+    """Makes a table of the reach of the given base, also by height, and of the best base."""
     table = Table(title=f"reach of a {measured['model']}", title_justify="left")
     for heading in ("base x, y, z, m", "yaw, deg", "workspace"):
         table.add_column(heading, justify="right")

@@ -2,8 +2,8 @@
 
 The first action of each episode is made to fail in one of three ways: the object is moved while the
 hand comes down, the grasp is off, or the place is off. The benchmark counts how often this object
-is in its cavity in the end, and how often an object is disturbed after it was placed. Undisturbed
-episodes are the baseline.
+is in its cavity in the end. It also counts how often an object that was in its cavity is picked
+again, or is not in its cavity in the end. Episodes without an induced failure are the baseline.
 """
 
 import dataclasses
@@ -111,7 +111,8 @@ def _shifted(pose: PlanarPose, offset: NDArray[np.float64]) -> PlanarPose:
 
 
 class _Adversary:
-    """An `EpisodeObserver` that makes the first action fail, and counts disturbed objects."""
+    """An `EpisodeObserver` that makes the first action fail, and records which objects are in their
+    cavities and which of them are picked again."""
 
     def __init__(
         self,
@@ -200,12 +201,13 @@ _Strip = tuple[str, Sequence[StripFrame], Sequence[str]]
 
 @dataclass
 class _Count:
-    """Sums over all episodes with one disturbance."""
+    """Sums over all episodes with one kind of disturbance."""
 
     recovered: int = 0
-    """The number of disturbed objects that were in their cavities in the end."""
+    """The number of objects whose action was made to fail, and which were in their cavities in the
+    end."""
     disturbed: int = 0
-    """The number of episodes with a disturbed object."""
+    """The number of episodes in which an object's action was made to fail."""
     kitted: int = 0
     objects: int = 0
     touched: int = 0
@@ -223,7 +225,7 @@ class _Count:
 def benchmark_recovery(
     chosen: ChosenScenario, episodes: int, seed: int, console: Console
 ) -> tuple[dict[str, Any], bytes]:
-    """Runs episodes with each disturbance.
+    """Runs episodes with each kind of disturbance.
 
     Args:
         chosen: the scenario with the tested policy.

@@ -242,7 +242,7 @@ def _draw_noise(rng: np.random.Generator) -> SensorNoiseParameters:
 
 
 def fit(judged: list[Judged]) -> Reliability:
-    """Fits a logistic regression of the right decisions of one policy on their evidence.
+    """Fits a logistic regression that predicts from its evidence whether a decision is right.
 
     The threshold is `LEAST_CONFIDENCE`.
     """

@@ -111,12 +111,14 @@ def drawn_case(
 ) -> tuple[PhotoSpec, PlacedTool]:
     """Draws the conditions of a photo of a tool at random, and places the tool on the sheet.
 
-    All photos together cover three heights and tilts, both backgrounds, and light from all sides.
+    All photos together cover three heights of tools, three tilts of the camera, both backgrounds,
+    and light from all sides.
 
     Args:
         name: the name of the tool.
         index: the number of the photo among all photos.
-        k: the number of the photo among the tool's photos, from 0 to 2; it gives the height.
+        k: the number of the photo among the tool's photos, from 0 to 2, which selects the
+            tool's height.
         exif: whether the photo states its focal length.
         seed: the seed of the photos.
     """

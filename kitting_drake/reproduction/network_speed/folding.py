@@ -73,7 +73,7 @@ def measure_folding(setup: SpeedSetup) -> dict[str, Any]:
             name: float((output - exact).std() / exact.std()) for name, output in outputs.items()
         },
         "alpha_operations": {
-            # Operations under autocast cannot be counted, but they are the same.
+            # Count in float32: autocast has the same operations, but they cannot be counted.
             name: count_operations(inferring(*_alpha(exported[f"{name}_float32"], setup)))
             for name in ("escnn", "ours")
         },

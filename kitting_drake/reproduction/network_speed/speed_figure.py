@@ -27,7 +27,7 @@ _RUNGS = {
 _BARRED = ("training_step", "decision")
 """The measures that are drawn as bars; the tables have all measures."""
 _COLUMNS = 6
-"""The number of columns of the grid of panels, which the presets share."""
+"""The number of columns in the grid of panels; each preset takes an equal number of them."""
 _STYLE = {
     "font.size": 12.0,
     "axes.edgecolor": "0.5",

@@ -88,7 +88,7 @@ def points_text(found: Estimate) -> str:
 
 
 def over_tools(outcomes: Sequence[Mapping[str, Any]], rate: str) -> Estimate | None:
-    """Computes the share of successes, with a bootstrap interval over tools.
+    """Computes the share of objects that succeed, with a bootstrap interval over tools.
 
     This interval applies to other tools of the same kind, unlike an interval over objects.
 

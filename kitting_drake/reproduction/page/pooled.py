@@ -22,8 +22,8 @@ _, _UNSEEN = PAPER_TASKS
 def pooled_section(runs: Sequence[Run]) -> list[str]:
     """Writes the section that pools the runs of each shipped policy with its default options.
 
-    Only runs whose weights have the digest of the shipped ones count, and no seed counts twice.
-    Without such runs, there is no section.
+    Only runs whose weights have the digest of the shipped ones count. Without such runs, the
+    section is empty.
 
     Args:
         runs: all reproducible runs that fill no cell of the paper's tables.
@@ -59,7 +59,7 @@ def pooled_section(runs: Sequence[Run]) -> list[str]:
 
 
 def shipped_policies() -> dict[str, Policy]:
-    """Returns the policies that need no training, by their names in tables."""
+    """Returns the policies that are shipped ready for use, by their names in tables."""
     return {
         "generalist": Learned(weights=""),
         "from 100 demonstrations": load_scenario(SCENARIOS / "paper/kitting_unseen.yaml").policy,

@@ -48,7 +48,7 @@ def protocol_page(
         link: the path from the page's folder to that of the table of runs.
         cells: the sections from
             `kitting_drake.reproduction.paper.protocol_sections.protocol_sections`.
-        set_aside: the runs that nobody can repeat, which are in no other table.
+        set_aside: the runs that nobody can repeat. They are listed in a table of their own.
     """
     sections = [prose("protocol", link=link), *cells]
     if runs:

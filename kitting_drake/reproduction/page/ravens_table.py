@@ -44,7 +44,8 @@ PAPER: dict[tuple[str, int], tuple[tuple[float, float, float], ...]] = {
 
 
 def in_ravens_table(run: Run) -> bool:
-    """Whether a run is of one of the five Ravens tasks by default, with refined actions."""
+    """Whether a run is of one of the five Ravens tasks, with its default scenario and refined
+    actions."""
     if run.summary["task"] not in TASKS or run.departures:
         return False
     return run.method not in LEARNED or bool(run.detail("continuous"))

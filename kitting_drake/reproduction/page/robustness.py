@@ -28,9 +28,9 @@ _COMPARED = ("generalist, minus unperturbed", "generalist, minus shape matching"
 """The paired differences, in points, on the seeds that both runs have."""
 _TRIES = 2
 _FRAMES = 5
-"""The number of images per observation in further rows."""
+"""The number of images per observation in the additional rows for `depth_noise` and `all`."""
 _SEEDS = range(2870, 2895)
-"""The seeds of all cells of the first table. They were unseen before their first run."""
+"""The seeds of every cell of the first table. They were not used before these runs."""
 _FEWEST = 12
 """The least number of these seeds, counted from the first, for levels other than moderate."""
 
@@ -105,7 +105,7 @@ def _table(found: Mapping[Key, Sequence[Run]], labels: Sequence[str], counted: b
     Args:
         found: the runs by row and method.
         labels: the labels of the rows.
-        counted: whether cells have the number of objects.
+        counted: whether cells show the number of objects.
     """
 
     def share(key: Key) -> str:
@@ -144,8 +144,8 @@ def _table(found: Mapping[Key, Sequence[Run]], labels: Sequence[str], counted: b
 
 
 def _needless_table(found: Mapping[Key, Sequence[Run]], labels: Sequence[str]) -> str:
-    """Writes a table with one row for each perturbation with distractors; it is empty without
-    runs."""
+    """Writes a table of needless actions, with one row for each perturbation with distractors; it
+    is empty without runs."""
 
     def share(key: Key) -> str:
         summaries = [run.summary for run in found.get(key, ())]

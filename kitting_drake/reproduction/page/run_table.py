@@ -1,10 +1,10 @@
 """Reads and writes the files behind the pages of results, which hold the summaries of all runs.
 
-`runs.csv` has one row per run, with the short fields of the `summary.json` of `evaluate`. A field
-of a dictionary in it has a name such as `versions.drake`. An empty cell means that the run lacks
-the field. `episodes.jsonl.xz` is compressed and has one line per run with the other fields:
-`outcomes` (the success rate of each episode, and how each object ended), `categories` and
-`resolved_scenario`. The two files together hold every summary in full.
+`runs.csv` has one row per run, with the short fields of the `summary.json` of `evaluate`. A nested
+field has a column such as `versions.drake`. An empty cell means that the run lacks the field.
+`episodes.jsonl.xz` is compressed and has one line per run with the other fields: `outcomes` (the
+success rate of each episode, and how each object ended), `categories` and `resolved_scenario`. The
+two files together hold every summary in full.
 """
 
 import csv

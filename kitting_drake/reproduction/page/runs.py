@@ -68,12 +68,12 @@ _HAND = (
     "planner.search.speed",
 )
 _EARLIER_HAND = "an earlier hand"
-"""The label of runs whose summaries lack the fields `_HAND`. In them the hand did not grip heavy
-objects more firmly, press objects down or search in a spiral. Grasps narrower than 3 mm counted as
-failed."""
+"""The label of runs whose summaries lack the fields `_HAND`. In these runs the hand did not grip
+heavy objects more firmly, press objects down or search in a spiral. Grasps narrower than 3 mm
+counted as failed."""
 
 _UNLIMITED_HAND = {"lower_speed": 0.08, "minimum_width": 0.0015}
-"""The planner's defaults in runs in which no contact force ended an action."""
+"""The planner's defaults in older versions, in which contact forces did not end actions."""
 
 _LIMITED_HAND = (
     "peak_grasp_force",
@@ -204,9 +204,9 @@ def has_unlimited_hand(scenario: Mapping[str, Any]) -> bool:
 
 
 def _with_present_hand(planner: dict[str, Any]) -> dict[str, Any]:
-    """Returns the planner of a run of an older version with today's defaults.
+    """Returns the fields of an older run's planner, updated for comparison with present runs.
 
-    Today's defaults replace those of that version, and fill in the fields that it lacks.
+    Fields that the older version lacked or had at its defaults get the present defaults.
     """
     defaults = _defaults()["planner"]
     former = [key for key, value in _UNLIMITED_HAND.items() if planner.get(key) == value]

@@ -61,9 +61,11 @@ def changeable(summary: Mapping[str, Any]) -> Changeable:
 
     - At least F - n actions follow a failed grasp: in each episode, all failed grasps but the first
       one follow it.
-    - At most all actions of n episodes follow a failed grasp, except the first action of each,
-      which is the failed one. In the other episodes each placed object took an action. So the bound
-      is largest if the n episodes are those with the fewest placed objects.
+    - At most, n episodes begin with a failed grasp, and all of their later actions follow it. The
+      other episodes need at least one action for each placed object. So the bound is the number of
+      all actions, minus n, minus the number of objects placed in the other episodes. It assumes
+      that the n episodes are those with the fewest placed objects. It is also at most the number of
+      actions that the task allows in n episodes, minus n.
 
     Args:
         summary: the summary that `evaluate` wrote for a learned policy. If it has no number of

@@ -29,19 +29,19 @@ STEADIER = {
     ("palletizing_boxes", "equivariant_transporter", 1): 1e-3,
 }
 """Learning rates, by task, method and number of demonstrations, of trainings that diverge at the
-best rate of their `reference`. Each is the second-best rate there. With ten demonstrations, the
-pick-angle loss diverged."""
+best rate of their `reference`. Each is the second-best rate of that `reference`. With ten
+demonstrations, the pick-angle loss diverged."""
 MATCHED = "matched"
-"""The preset in which a baseline has the same share of its original's parameters as the SO(2)
-networks have of theirs; see `paper.parameter_table`."""
+"""The preset in which a baseline's networks are smaller than the original ones by about the same
+factor as the SO(2) networks; see `paper.parameter_table`."""
 ROTATIONS = 18
 """The number of rotations, of 36, in a training step of the Transporter in the cells of
 `_every_chance`."""
 EVERY_CHANCE = "every_chance"
 """The label of the cells of `_every_chance`."""
 BEYOND_OF_TABLE_1 = ("stack_block_pyramid",)
-"""The tasks of table I that are run with our extensions as well. On them, the published SO(2)
-method scores lower here than in the paper after ten or a hundred demonstrations."""
+"""The tasks of table I that are run with our extensions as well. On these, the published SO(2)
+method scores lower in our runs than in the paper, after ten or a hundred demonstrations."""
 
 
 def _paper_cell(
@@ -168,9 +168,9 @@ def _ablation() -> list[Cell]:
 def _every_chance() -> list[Cell]:
     """Returns cells in which the baselines get larger networks and longer training.
 
-    They are on the tasks on which the baselines score lower than in the paper. The networks have
-    the same share of the originals' parameters as the SO(2) networks. The Transporter also learns
-    from more rotations per step, in more steps.
+    They are on the tasks on which the baselines score lower than in the paper. The larger networks
+    are those of the preset `MATCHED`. The Transporter also learns from more rotations per step, in
+    more steps.
     """
     trainings = [
         *(

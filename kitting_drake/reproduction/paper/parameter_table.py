@@ -1,4 +1,4 @@
-"""Writes the table of the parameters of every network and of its original.
+"""Writes the table that compares the size of every network with that of the original network.
 
 The parameters are counted on the networks themselves.
 """
@@ -15,7 +15,7 @@ ORIENTATIONS = 36
 PRESETS = ("small", "matched", "paper")
 COLUMNS = ("alpha", "beta", "phi", "psi")
 ORIGINAL = {"alpha": 4_537_185, "beta": 835_888, "phi": 4_537_185, "psi": 4_537_185}
-"""The parameters of the authors' SO(2) networks."""
+"""The numbers of parameters of the authors' SO(2) networks."""
 
 _TEXT = f"""\
 #### Parameters of every network
@@ -70,7 +70,7 @@ def count_parameters(method: str, preset: str) -> dict[str, int]:
 
 
 def original_parameters(method: str) -> int:
-    """Returns the number of parameters of all original networks of a method."""
+    """Returns the total number of parameters of a method's original networks."""
     counts = ORIGINAL if method == "so2" else count_parameters(method, "paper")
     return sum(counts.values())
 
