@@ -17,7 +17,7 @@ from kitting_drake.real_camera.calibrations.yaml_values import matrix, numbers
 Array = NDArray[np.float64]
 
 _ORTHOGONAL = 1e-3
-"""The largest difference between an entry of R^T R and that of the identity."""
+"""The largest accepted difference between an entry of R^T R and that of the identity."""
 _FARTHEST = 20.0
 """The distance of a camera from the base, in metres, above which its position is probably not in
 metres."""

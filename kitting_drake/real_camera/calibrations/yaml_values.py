@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 
 class _Loader(yaml.SafeLoader):
-    """A loader of YAML with `cv2.FileStorage` matrices, for which repeated fields are errors."""
+    """A loader of YAML that also reads `cv2.FileStorage` matrices, and rejects repeated fields."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         """Returns the mapping of a node.

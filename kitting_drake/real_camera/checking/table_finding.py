@@ -50,8 +50,8 @@ table and the largest plane is the floor."""
 _TABLE_SHARE = 0.1
 """The least number of points of a table above a floor, as a share of the floor's points."""
 _BAND = 0.006
-"""The largest distance of points of the plane from it, in metres. Three times the noise is used if
-it is larger."""
+"""Points within this distance of the plane, in metres, belong to it. Three times the noise is used
+if that is larger."""
 _LOW = 0.12
 """The largest height of an object on the table, in metres. Anything taller, such as the robot, is
 not part of the table."""
@@ -66,7 +66,7 @@ table. Narrower things, such as profiles along the edge, do not count."""
 _LEAST_TALL = 0.02
 """The width below which tall things count as noise, in metres."""
 _AROUND = 0.02
-"""The margin around tall things that is ignored, in metres."""
+"""The width of a margin around tall things, in metres. The margin is ignored as well."""
 _TOO_NEAR = 0.25
 """The distance from the middle of an arm's base within which it cannot pick, in metres."""
 _ENOUGH = 0.6

@@ -37,7 +37,7 @@ _SHIFT = 0.42
 _LEVEL = math.radians(3)
 """The largest tilt, in radians, of a board that lies on the table."""
 _TOUCHED = 0.003
-"""The largest error of the distance between touched corners, in metres."""
+"""The largest accepted error of the distance between touched corners, in metres."""
 _LARGEST = 2.0
 """The size in metres above which a board's sizes are probably in millimetres."""
 

@@ -223,7 +223,7 @@ def _scenes(first_seed: int) -> Iterator[DrawnScene]:
 def _draw_noise(rng: np.random.Generator) -> SensorNoiseParameters:
     """Draws image noise, and calibration errors of up to about 1 mm and 0.1 degrees.
 
-    In 30 % of the draws there are none.
+    In 30 % of the draws there is neither noise nor an error.
     """
     if rng.random() < 0.3:
         return SensorNoiseParameters()

@@ -39,7 +39,7 @@ _MOST_FRUITLESS = 5
 
 @dataclass(frozen=True)
 class Release:
-    """A tool at the moment when the jaws begin to open, and its station."""
+    """A tool at the moment when the jaws begin to open, and the station of its episode."""
 
     station: KittingStation
     index: int

@@ -72,8 +72,7 @@ def paper_sections(
 
 
 def has_figure(task: str, results: Sequence[Result]) -> bool:
-    """Whether there are results of both methods that figure 6 compares on a task, so that it can be
-    drawn."""
+    """Whether figure 6 can be drawn for a task: both methods that it compares have results."""
     methods = {
         result.cell.policy.method
         for result in results

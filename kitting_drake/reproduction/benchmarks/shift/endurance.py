@@ -349,14 +349,17 @@ def summarise_shift(
 
 
 def _between(minutes: float, assists: int) -> list[float | None]:
-    """Returns the exact 95 % interval of the minutes between events of a Poisson process."""
+    """Returns the exact 95 % interval of the mean time between assists, in minutes.
+
+    The assists are assumed to be a Poisson process.
+    """
     most = stats.chi2.ppf(0.975, 2 * assists + 2) / 2
     least = stats.chi2.ppf(0.025, 2 * assists) / 2 if assists else 0.0
     return [float(minutes / most), float(minutes / least) if least else None]
 
 
 def _distribution(cycles: Any) -> dict[str, Any]:
-    """Returns the median, the 95th percentile and a histogram of cycles, in s."""
+    """Returns the median, 95th percentile, maximum and histogram of cycles, in s."""
     if not len(cycles):
         return {"median": None, "p95": None, "max": None, "bin_width": _WIDTH, "histogram": []}
     bins = np.bincount((cycles / _WIDTH).astype(int))
