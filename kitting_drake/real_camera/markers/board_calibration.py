@@ -118,7 +118,8 @@ def _calibrate_camera(board: Board, paths: Sequence[Path], camera: BenchCamera) 
         if fit.rms > alone + _MOVED:
             raise UserError(
                 f"{where}: a common pose for all images has an error of {fit.rms:.2f} pixels, but "
-                f"separate poses at most {alone:.2f}: did the board or the camera move in between?"
+                f"separate poses at most {alone:.2f}: did the board or the camera move between the "
+                "images?"
             )
     corners = sum(len(item.points) for item in seen)
     return CalibratedCamera(camera.name, images[0], seen[0], len(paths), corners, fit)

@@ -33,7 +33,7 @@ def test_reads_every_field(tmp_path: Path):
     [
         ("model: ur5", "model must be fr3 or panda, not 'ur5'"),
         ("modle: fr3", "unknown field 'modle': did you mean 'model'"),
-        ("base: [100, 0, 0]", r"base is \(100, 0, 0\), more than"),
+        ("base: [100, 0, 0]", r"base is \(100, 0, 0\), but no coordinate"),
         ("base: [0, 0]", "base must hold 3 numbers"),
         ("joints: [0, 0, 0, 0, 0, 0, 0]", r"joints\[3\] is 0, outside of -3.0421 to -0.1518 rad"),
         ("rate: 30", "rate must be a whole number from 200 to 1000 Hz, not 30"),
