@@ -54,12 +54,14 @@ def pooled_section(runs: Sequence[Run]) -> list[str]:
     return [
         "### Unseen toolsets, all runs of the shipped policies\n",
         prose("pooled"),
-        markdown_table(["policy", "seeds", "objects", "strict, %", "paper's, %"], rows, 2),
+        markdown_table(
+            ["policy", "seeds", "objects", "strict success, %", "paper's measure, %"], rows, 2
+        ),
     ]
 
 
 def shipped_policies() -> dict[str, Policy]:
-    """Returns the policies that are shipped ready for use, by their names in tables."""
+    """Returns the policies that come with the project, by their names in tables."""
     return {
         "generalist": Learned(weights=""),
         "from 100 demonstrations": load_scenario(SCENARIOS / "paper/kitting_unseen.yaml").policy,
@@ -84,4 +86,7 @@ def _check_seeds(label: str, runs: Sequence[Run]) -> None:
     twice = min((seed for seed, count in counts.items() if count > 1), default=None)
     if twice is not None:
         files = " and ".join(run.name for run in runs if twice in run.summary["seeds"])
-        raise UserError(f"{files} both have seed {twice} of {label}: remove one of them")
+        raise UserError(
+            f"the runs {files} both have seed {twice} of {label}: remove one of them "
+            "(results --remove)"
+        )

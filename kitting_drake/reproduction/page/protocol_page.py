@@ -166,8 +166,8 @@ def _most_tested_run(runs: list[Run]) -> list[str]:
         markdown_table(
             [
                 "category",
-                "strict, %",
-                "paper's, %",
+                "strict success, %",
+                "paper's measure, %",
                 "ADD-S, mm",
                 "position, mm",
                 "angle, deg",
@@ -175,7 +175,8 @@ def _most_tested_run(runs: list[Run]) -> list[str]:
             ],
             placed,
         ),
-        "Errors of the policy's actions, against the annotated grasp and the goal.\n",
+        "Errors of the policy's actions from the annotated grasp and the goal: median and "
+        "95th percentile.\n",
         markdown_table(["category", "pick, mm", "pick, deg", "place, mm", "place, deg"], acted),
     ]
 
@@ -214,8 +215,9 @@ def _others_table(runs: list[Run]) -> str:
         ]
         for run in runs
     ]
-    headings = ["name", "task", "run", "what differs", "success", "strict, %", "success, %"]
-    return markdown_table([*headings, "episodes", "seeds"], rows, left_columns=5)
+    headings = ["name", "task", "run", "what differs", "criterion of success"]
+    headings += ["strict success, %", "success, %", "episodes", "seeds"]
+    return markdown_table(headings, rows, left_columns=5)
 
 
 def _mishaps(runs: Sequence[Run], link: str) -> str:
@@ -231,7 +233,7 @@ def _aside_table(runs: Sequence[Run]) -> str:
         [run.name, _strict(run.summary), _own(run.summary), _weights(run), *_commits(run)]
         for run in runs
     ]
-    return markdown_table(["name", "strict, %", "success, %", "weights", "commit"], rows)
+    return markdown_table(["name", "strict success, %", "success, %", "weights", "commit"], rows)
 
 
 def _commits(run: Run) -> list[str]:

@@ -44,8 +44,8 @@ PAPER: dict[tuple[str, int], tuple[tuple[float, float, float], ...]] = {
 
 
 def in_ravens_table(run: Run) -> bool:
-    """Whether a run is of one of the five Ravens tasks, with its default scenario and refined
-    actions."""
+    """Whether a run is of one of the five Ravens tasks with its default settings, and of a policy
+    with refined actions or without networks."""
     if run.summary["task"] not in TASKS or run.departures:
         return False
     return run.method not in LEARNED or bool(run.detail("continuous"))
@@ -80,7 +80,7 @@ def ravens_section(runs: Sequence[Run]) -> list[str]:
     headings = ["method", "N", "demonstrations", *TASKS]
     return [
         "### The five Ravens tasks, by default\n",
-        "Actions are refined to less than a pixel and a bin. A cell has the mean reward in "
+        "Actions are finer than a pixel and an angle bin. A cell has the mean reward in "
         "percent, its 95 %\ninterval and the number of episodes.\n",
         markdown_table(headings, rows),
     ]

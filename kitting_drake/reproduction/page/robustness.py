@@ -24,15 +24,15 @@ _COLUMNS = {
     "generalist": "generalist",
     "shape_matching": "shape matching",
 }
-_COMPARED = ("generalist, minus unperturbed", "generalist, minus shape matching")
+_COMPARED = ("generalist minus its unperturbed rate", "generalist minus shape matching")
 """The paired differences, in points, on the seeds that both runs have."""
 _TRIES = 2
 _FRAMES = 5
-"""The number of images per observation in the additional rows for `depth_noise` and `all`."""
+"""The number of images per observation in the rows with several frames."""
 _SEEDS = range(2870, 2895)
 """The seeds of every cell of the first table. They were not used before these runs."""
 _FEWEST = 12
-"""The least number of these seeds, counted from the first, for levels other than moderate."""
+"""Runs at a level other than moderate have at least this many of these seeds, from the first on."""
 
 Key = tuple[str, str]
 """The label of a row of the table, and a method."""
@@ -87,8 +87,8 @@ def robustness_table(runs: Sequence[Run]) -> str:
     if needless:
         parts.append(
             "Some actions were on objects that have no cavity, such as boxes. The table has the "
-            "number of these\nactions, of all actions in these runs. Success rates do not include "
-            "these objects:\n\n" + needless
+            "number of these\nactions, out of all actions in these runs. Success rates do not "
+            "include these objects:\n\n" + needless
         )
     if further:
         parts.append(
@@ -144,8 +144,8 @@ def _table(found: Mapping[Key, Sequence[Run]], labels: Sequence[str], counted: b
 
 
 def _needless_table(found: Mapping[Key, Sequence[Run]], labels: Sequence[str]) -> str:
-    """Writes a table of needless actions, with one row for each perturbation with distractors; it
-    is empty without runs."""
+    """Writes a table of the actions on objects without a cavity, with one row for each perturbation
+    with distractors; it is empty without runs."""
 
     def share(key: Key) -> str:
         summaries = [run.summary for run in found.get(key, ())]
@@ -173,7 +173,8 @@ def _check_seeds(found: Mapping[Key, Sequence[Run]]) -> None:
         if twice is not None:
             files = " and ".join(run.name for run in runs if twice in run.summary["seeds"])
             raise UserError(
-                f"{files} both have seed {twice} of {_COLUMNS[method]}, {label}: delete one of them"
+                f"the runs {files} both have seed {twice} of {_COLUMNS[method]}, {label}: remove "
+                "one of them (results --remove)"
             )
 
 

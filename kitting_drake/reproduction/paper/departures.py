@@ -15,11 +15,15 @@ from kitting_drake.reproduction.paper.failed_grasps import changeable, is_as_in_
 
 _NOT_MEASURED = (
     ("physics and cameras", "another simulator", "Drake, hydroelastic contact; its own cameras"),
-    ("arm", "an arm", "the hand alone, moving in x, y, z and yaw faster than an arm could"),
+    ("speed of the floating hand", "not given", "faster than an arm could move it"),
     ("rim of a cavity", "not given", "a lead-in bevel of 1 mm"),
     ("friction of a kit", "not given", "0.3"),
-    ("scenes", "not given", "drawn until the open hand has room at every annotated grasp"),
-    ("release, in cells marked `e`", "the jaws open by 5 mm in all", "each jaw opens by 6 mm"),
+    (
+        "poses in a scene",
+        "not given",
+        "drawn until the open hand has room at every annotated grasp",
+    ),
+    ("release, in cells marked `e`", "the jaws open by 5 mm in all", "by 12 mm in all"),
     ("open jaws, place red in green, cells marked `e`", "50 mm apart", "80 mm apart"),
     ("demonstrated picks, in cells marked `e`", "off the middle along one axis", "at the middle"),
     (
@@ -28,11 +32,11 @@ _NOT_MEASURED = (
         f"preset `{PRESET}`: ours has 1/25 of the parameters, the Transporter 1/70",
     ),
     ("label", "one-hot", "shared among neighbouring pixels and orientations"),
-    ("search for a place", "one correlation", "starts at half the resolution, with its own loss"),
+    ("search for a place", "one correlation", "first at half the resolution, with its own loss"),
     (
-        "shift of a scene",
+        "random shift of training scenes",
         "not given",
-        "a standard deviation of a sixth of each side (Ravens: of the shorter side)",
+        "standard deviation: a sixth of each side (Ravens: of the shorter side)",
     ),
     ("alpha", "the paper's classes", 'one more class, "nothing to pick"'),
     ("checkpoint", "the best on the test runs", "the best on separate validation scenes"),
@@ -44,7 +48,7 @@ _NOT_MEASURED = (
     (
         "learning rate",
         "0.0001 for every method",
-        "0.001 for ours, the best of three for others",
+        "0.001 for ours, the best of three for each baseline",
     ),
 )
 """The differences whose effect was not measured: name, the paper's or Ravens' way, and ours."""
@@ -63,7 +67,7 @@ def departures(results: Mapping[str, Result]) -> str:
             "1000 to 3000; the rate rises, then falls",
             _compared(
                 results,
-                "three times the steps, ours, pyramid",
+                "with three times the steps, ours, pyramid",
                 {
                     f"N = {n}": (f"{name}_3_times_the_steps", name)
                     for n in (180, 36)
@@ -77,7 +81,7 @@ def departures(results: Mapping[str, Result]) -> str:
             "trained once, at N = 180",
             _compared(
                 results,
-                "trained at N = 36",
+                "if trained at N = 36",
                 {
                     label: (f"{name}_trained_at_36", name)
                     for label, name in (
@@ -92,7 +96,7 @@ def departures(results: Mapping[str, Result]) -> str:
             ),
         ),
         (
-            "memory",
+            "memory of failed grasps",
             "none",
             "no pick within 10 mm of a failed grasp of the same episode",
             _memory(results),
@@ -143,5 +147,5 @@ def _memory(results: Mapping[str, Result]) -> str:
         if found:
             total = sum(found[1:], found[0])
             least, most = (100 * count / total.actions for count in (total.at_least, total.at_most))
-            parts.append(f"{label}: {least:.1f} to {most:.1f} % of the actions")
-    return "; ".join(parts) or "not yet measured"
+            parts.append(f"{label}: {least:.1f} to {most:.1f} %")
+    return f"actions that may differ:<br>{'<br>'.join(parts)}" if parts else "not yet measured"

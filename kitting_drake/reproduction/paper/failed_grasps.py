@@ -113,7 +113,8 @@ def failed_grasps(results: Sequence[Result]) -> list[str]:
             unchanged = sum(not cell.at_most for cell in cells)
             share = f"{100 * total.at_most / total.actions:.0f} %"
             rows.append([task, METHODS[method], str(len(cells)), str(unchanged), total.text, share])
-    headings = ["task", "method", "cells", "nothing failed", "after a failed grasp", "at most"]
+    headings = ["task", "method", "cells", "cells without failed grasps"]
+    headings += ["actions after a failed grasp", "at most"]
     return [
         "### The memory of failed grasps\n",
         prose("failed_grasps"),

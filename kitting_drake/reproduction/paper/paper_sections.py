@@ -186,7 +186,7 @@ def fresh_tools(results: Sequence[Result], again: Collection[str] = ()) -> list[
     return [
         "### Ten fresh tools\n",
         prose("fresh_tools"),
-        markdown_table(["policy", "strict, %", "over tools", "paper's, %"], rows),
+        markdown_table(["policy", "strict success, %", "over tools", "paper's measure, %"], rows),
     ]
 
 

@@ -32,8 +32,8 @@ STEADIER = {
 best rate of their `reference`. Each is the second-best rate of that `reference`. With ten
 demonstrations, the pick-angle loss diverged."""
 MATCHED = "matched"
-"""The preset in which a baseline's networks are smaller than the original ones by about the same
-factor as the SO(2) networks; see `paper.parameter_table`."""
+"""The preset in which a baseline's networks are smaller than the original by the same factor as the
+SO(2) networks; see `paper.parameter_table`."""
 ROTATIONS = 18
 """The number of rotations, of 36, in a training step of the Transporter in the cells of
 `_every_chance`."""
@@ -49,7 +49,7 @@ def _paper_cell(
 ) -> Cell:
     # Networks that do not depend on N are trained once, at the largest N. These are all SO(2)
     # networks, and all networks of the Equivariant Transporter but the pick-angle network.
-    # `_checks` verifies this.
+    # The cells of `_checks` measure the effect.
     trained_at = ORIENTATIONS[0] if method == "so2" else n
     shared = (
         method == "equivariant_transporter" and n != ORIENTATIONS[0] and TASKS[task].table == "6"
@@ -168,9 +168,9 @@ def _ablation() -> list[Cell]:
 def _every_chance() -> list[Cell]:
     """Returns cells in which the baselines get larger networks and longer training.
 
-    They are on the tasks on which the baselines score lower than in the paper. The larger networks
-    are those of the preset `MATCHED`. The Transporter also learns from more rotations per step, in
-    more steps.
+    They are on the tasks on which the baselines score lower than in the paper. The networks are
+    smaller than the originals by the same factor as the SO(2) networks. The Transporter also learns
+    from more rotations per step, in more steps.
     """
     trainings = [
         *(
@@ -233,7 +233,7 @@ SHIPPED = {
 
 
 def _fresh_tools() -> list[Cell]:
-    """Returns the cells of the shipped policies on unseen tools."""
+    """Returns the cells of the shipped policies on the ten fresh tools."""
     return [Cell("fresh", policy, None, label, search=True) for label, policy in SHIPPED.items()]
 
 
@@ -264,6 +264,8 @@ def choose_cells(patterns: Sequence[str]) -> list[Cell]:
     for pattern in patterns:
         matching = {cell.name: cell for cell in paper_cells() if fnmatch(cell.name, pattern)}
         if not matching:
-            raise UserError(f"--cells: no cell matches '{pattern}'")
+            raise UserError(
+                f"--cells: no cell matches '{pattern}': docs/protocol.md has names of cells"
+            )
         chosen |= matching
     return list(chosen.values())

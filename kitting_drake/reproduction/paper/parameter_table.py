@@ -21,12 +21,12 @@ _TEXT = f"""\
 #### Parameters of every network
 
 The table has the trainable parameters at N = {ORIENTATIONS}. The only picking network of the
-Transporter, f_pick, is under alpha. The last column compares with the original. For both baselines,
-the original is our preset `paper`.
+Transporter, f_pick, is under alpha. The last column has the ratio to the original's parameters. For
+both baselines, the original is our preset `paper`.
 
-The presets `small` and `matched` differ in the baselines only. In `matched`, the Transporter keeps
-the same share of its original's parameters as our method does. The pick-angle network (beta) of the
-Equivariant Transporter has as many parameters as ours.
+The presets `small` and `matched` differ in the baselines only. Our networks are 25 times smaller
+than the paper's. In `matched`, so is the Transporter, and the pick-angle network (beta) of the
+Equivariant Transporter has about as many parameters as ours.
 
 The parameters of the originals come from these sources:
 
@@ -90,5 +90,5 @@ def parameters_section() -> str:
             rows.append([METHODS[method], ", ".join(presets), *texts, f"{total:,}", share])
         if method in _ORIGINAL_TEXTS:
             rows.append([METHODS[method], "*original*", *_ORIGINAL_TEXTS[method], ""])
-    headings = ["method", "preset", *COLUMNS, "all", "of the original"]
+    headings = ["method", "preset", *COLUMNS, "all", "ratio"]
     return f"{_TEXT}\n{markdown_table(headings, rows, left_columns=2)}"

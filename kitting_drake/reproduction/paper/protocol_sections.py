@@ -250,7 +250,7 @@ def _every_cell(results: Sequence[Result]) -> str:
         "type",
         "episodes",
     ]
-    headings += ["seeds", "strict, %", "over tools", "paper's, %", "causes"]
+    headings += ["seeds", "strict success, %", "over tools", "paper's measure, %", "causes"]
     headings += ["weights", "Drake", "commit", "after a failed grasp"]
     return prose("every_cell") + "\n" + markdown_table(headings, rows)
 

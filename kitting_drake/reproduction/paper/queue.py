@@ -38,7 +38,7 @@ from kitting_drake.reproduction.paper.cells import (
 from kitting_drake.reproduction.paper.learning_rates import best_rate, read_rates, write_rates
 
 _PATIENCE = 60.0
-"""The time in which a terminated command may exit, in s."""
+"""The time that a terminated command has to exit, in s."""
 _FIRST_SEED, _FIRST_VALIDATION_SEED = 10000, 20000
 _BEFORE = {"angle_only": False}
 """The values of fields that the summaries of older trainings lack."""
