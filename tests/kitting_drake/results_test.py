@@ -261,7 +261,7 @@ def test_without_runs_there_is_a_page(tmp_path: Path):
 
 def test_errors_name_the_invalid_run(folder: Path, tmp_path: Path):
     for details, words in (
-        ("so2", "'policy_details' is 'so2': it must be"),
+        ("so2", "'policy_details' is empty or of the wrong type \\('so2'\\): it must be"),
         ({"method": "so2", "orientations": 36}, "policy_details.demonstrations must be a whole"),
     ):
         spoil(folder, "ours", policy_details=details)

@@ -297,7 +297,9 @@ def read_evaluation(path: Path) -> Summary:
     try:
         summary = json.loads(path.read_text())
     except (OSError, ValueError) as error:
-        raise UserError(f"{path} cannot be read: {error}") from error
+        raise UserError(
+            f"{path} cannot be read ({error}): give the output folder of evaluate"
+        ) from error
     check_summary(summary, str(path))
     return summary
 
@@ -317,7 +319,9 @@ def check_summary(summary: Any, where: str) -> None:
         if not isinstance(summary, dict) or key not in summary:
             raise UserError(f"{where} lacks '{key}': {must}")
         if not isinstance(summary[key], kind) or summary[key] == []:
-            raise UserError(f"{where}: '{key}' is {summary[key]!r}: {must}")
+            raise UserError(
+                f"{where}: '{key}' is empty or of the wrong type ({summary[key]!r}): {must}"
+            )
     task = summary["resolved_scenario"].get("task")
     if not isinstance(task, dict) or "_tag" not in task:
         raise UserError(f"{where}: resolved_scenario has no task: {must}")

@@ -114,4 +114,6 @@ def check_new_cell(cell: Cell, summary: Summary, rates: Rates) -> None:
             "commit the changes and evaluate into a fresh folder"
         )
     if summary["policy_details"].get("method") in LEARNED and not summary["policy_digest"]:
-        raise UserError(f"run '{cell.name}' lacks policy_digest, the digest of its weights")
+        raise UserError(
+            f"run '{cell.name}' lacks policy_digest, the digest of its weights: evaluate it again"
+        )
