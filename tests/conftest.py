@@ -1,4 +1,4 @@
-"""Fixtures of all tests."""
+"""Fixtures for all tests."""
 
 import ctypes
 import gc
@@ -37,7 +37,7 @@ def pytest_unconfigure() -> None:
 def cache_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """A fresh cache, so that no test uses files of an older version.
 
-    The workers of pytest-xdist share it, as processes of `evaluate` do.
+    The workers of pytest-xdist share it, as the processes of `evaluate` share the user's cache.
     """
     folder = tmp_path_factory.getbasetemp()
     folder = (folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder) / "cache"

@@ -1,6 +1,6 @@
 """escnn works without lie_learn and without a compiler.
 
-That layers of the plane work is also shown by `escnn_reference_test`, in this process.
+Here its layers for the plane run in a new process; in this one `escnn_reference_test` runs them.
 """
 
 import subprocess

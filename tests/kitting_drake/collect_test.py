@@ -184,7 +184,7 @@ def test_fewer_demonstrations_after_a_stop_keep_the_parts(tmp_path: Path):
 
 
 def test_rejections_of_other_seeds_are_ignored(tmp_path: Path):
-    """A stopped run left them in the folder."""
+    """A stopped run of other seeds left its rejections in the folder."""
     (tmp_path / "parts").mkdir()
     rejected = {"seed": 3, "score": 0.0, "reason": "of another run"}
     (tmp_path / "parts" / "seed_00000003.json").write_text(json.dumps(rejected))
@@ -201,7 +201,7 @@ def test_a_file_of_another_origin_is_refused(tmp_path: Path):
 
 
 class Mortal(Oracle):
-    """Dies at seed 12, `deaths` times."""
+    """An oracle whose process dies the first `deaths` times that it is asked for seed 12."""
 
     def __init__(self, deaths: int, exit_code: int) -> None:
         super().__init__()
@@ -233,7 +233,7 @@ def test_a_seed_killed_from_outside_is_not_rejected(tmp_path: Path):
 
 
 class Recorder:
-    """Workers whose oracle demonstrates immediately, with three frames."""
+    """Replaces `LocalWorkers.run`: the oracle demonstrates immediately, with three frames."""
 
     def __init__(self) -> None:
         self.recorded: list[int] = []
@@ -316,7 +316,7 @@ def test_demonstrations_are_exported(
 ):
     pytest.importorskip("pyarrow", exc_type=ImportError)
     monkeypatch.chdir(ROOT)
-    # Use the scenario's grid.
+    # The oracle's images must have the scenario's grid.
     monkeypatch.setattr(sys.modules[__name__], "GRID", PixelGrid())
     monkeypatch.setattr(collecting, "require_rendering", lambda: None)
     monkeypatch.setattr(collecting, "build_any_chosen", lambda *_, **__: None)
@@ -330,7 +330,7 @@ def test_demonstrations_are_exported(
 
     main(1)
     assert not (tmp_path / "lerobot").exists()
-    # Frames that are missing are recorded without collecting; repeating it changes nothing.
+    # The export records missing frames, but collects nothing. A second export changes nothing.
     told = main(1, "--export", "lerobot")
     assert told.startswith("nothing to collect: ")
     assert told.endswith(f"as a LeRobotDataset: {tmp_path / 'lerobot'}/\n")
@@ -345,7 +345,7 @@ def test_demonstrations_are_exported(
         main(2, "--export", "lerobot", "--fps", "20")
     assert len(read_demonstrations(tmp_path / "demonstrations.h5").demonstrations) == 1
     shutil.rmtree(tmp_path / "lerobot")
-    # A rejected episode has no frames.
+    # Seed 11 is rejected, so it gets no frames.
     assert "holds 2 demonstrations" in main(2, "--export", "lerobot")
     assert recorder.recorded == [10, 12]
     info = json.loads((tmp_path / "lerobot" / "meta" / "info.json").read_text())

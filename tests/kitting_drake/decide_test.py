@@ -56,7 +56,10 @@ def rendered(seed: int, policy: str) -> Rendered:
 
 
 def check_against_cell(seed: int, folder: Path, orientations: int = 180) -> None:
-    """Checks the generalist's decision on files; on .npy it must be bit-identical."""
+    """Checks that the generalist decides on frames from files as in the cell.
+
+    On .npy the decisions must be bit-identical, on .png (whole millimetres) about equal.
+    """
     found = rendered(seed, f'!Learned {{weights: "", orientations: {orientations}}}')
     write_calibration(folder / "calibration.yaml", found.calibration)
     calibration = read_calibration(folder / "calibration.yaml")
@@ -67,7 +70,7 @@ def check_against_cell(seed: int, folder: Path, orientations: int = 180) -> None
     np.testing.assert_array_equal(decision.observation.valid, found.observation.valid)
     assert decision.action == found.action
     assert 0 <= decision.choice.confidence <= 1
-    # Depth rounded to millimetres may change the grasp, but not the tool, and its place is as true.
+    # Depth rounded to millimetres may change the grasp, but neither the tool nor where it goes.
     stepped = read_frames([write_frames(folder / "png", found.frames, "png")], calibration)
     other = decide(stepped, calibration, policy).action
     (tool, _), (same, true) = (true_action(found, item) for item in (decision.action, other))
@@ -143,7 +146,7 @@ def test_shape_matching_equals_that_in_the_cell(scene: Rendered):
 
 
 def test_a_higher_table_raises_the_action(scene: Rendered):
-    """The same scene in a base frame whose origin is 0.3 m below the table."""
+    """In a base frame whose origin is 0.3 m below the table, the same action is 0.3 m higher."""
     calibration = scene.calibration
     raised = dataclasses.replace(
         calibration,
@@ -233,7 +236,7 @@ SAMPLE = ROOT / "models" / "sample_frame"
 
 
 def test_writes_the_trajectory_of_a_robot_or_says_what_is_out_of_reach(tmp_path: Path, verb: Verb):
-    """The first decision is that of a process that loads neither Drake nor torch."""
+    """The first decision is made by a process that loads neither Drake nor torch."""
     robot, out = tmp_path / "robot.yaml", tmp_path / "out"
     arguments = [SAMPLE, "--camera", SAMPLE / "calibration.yaml", "--output", out]
     arguments += ["--shape_matching", "--robot", robot, "--rate", 500]
@@ -254,7 +257,7 @@ def test_writes_the_trajectory_of_a_robot_or_says_what_is_out_of_reach(tmp_path:
     rows = (tmp_path / "out" / "trajectory.csv").read_text().splitlines()
     assert len(rows) == 1 + len(message["points"])
     assert rows[0].startswith("time_from_start,position_fr3_joint1,")
-    # Far from the table nothing is written that could move an arm.
+    # If the arm cannot reach the pick, nothing is written that could move it.
     robot.write_text("{base: [-0.3, 0.9, 0], home: [-0.3, 0.5, 0.4, 0]}")
     assert verb("decide", *arguments).returncode == 0
     record = json.loads((out / "action.json").read_text())
@@ -265,7 +268,7 @@ def test_writes_the_trajectory_of_a_robot_or_says_what_is_out_of_reach(tmp_path:
 
 @pytest.mark.slow
 def test_networks_need_no_drake(tmp_path: Path, weights_file: Path):
-    # They act only if there is a kit, and here even though untrained networks are not sure.
+    # Networks act only if they see a kit. Untrained ones are not sure, so allow any confidence.
     bench = shutil.copytree(SAMPLE, tmp_path / "bench")
     flags = ("--orientations", 36, "--least_confidence", 0)
     done = command(bench, "--weights", weights_file, *flags)
@@ -543,7 +546,10 @@ def test_frames_may_be_pairs_of_files(bench: Path):
 
 
 def test_without_outlines_the_networks_certainty_counts(scene: Rendered):
-    """The fitted confidence is of decisions by outlines. Nothing is refused without being asked."""
+    """The confidence is then the product of the networks' probabilities.
+
+    Without `least_confidence`, no decision is refused.
+    """
     found = load_policy(fit_outlines=False, orientations=36).choose(scene.observation)
     assert not found.action.stop
     assert found.confidence == pytest.approx(np.prod(list(found.parts.values())))

@@ -47,7 +47,7 @@ POSES = {
 
 
 def write_step(folder: Path, shade: int, record: dict | None) -> None:
-    """A step: frames of a coloured block on the table, and its action."""
+    """Writes a step: frames of a coloured block on the table, and the record of the action."""
     block = Block((0.15, 0.08, 0.04), (0.45, -0.2, 0.01 * shade))
     frames = {
         name: Frame(np.full_like(frame.color, shade), frame.depth)
@@ -77,7 +77,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def folder(written: Path, tmp_path: Path) -> Path:
-    """Two demonstrations, with and without a stop at the end. One has more than nine steps."""
+    """Two demonstrations, one of which ends with a stop, at a step whose number has two digits."""
     return shutil.copytree(written, tmp_path, dirs_exist_ok=True) / "my bench"
 
 
@@ -145,7 +145,7 @@ def test_train_takes_the_file(folder: Path, command, monkeypatch: pytest.MonkeyP
 
 
 def test_seeds_identify_frames(folder: Path):
-    """The same frames get the same seed in any file."""
+    """A demonstration's seed depends on its frames only, not on the file or its neighbours."""
     first, second = folder.parent / "first.h5", folder.parent / "second.h5"
     convert(folder, BENCH, KITTING, first)
     (folder / "demo2").rename(folder / "again")
@@ -275,7 +275,7 @@ def test_folders_without_demonstrations_are_refused(tmp_path: Path):
 def test_calibrations_are_compared_by_value(tmp_path: Path):
     write_calibration(tmp_path / "same.yaml", BENCH)
     assert calibration_digest(read_calibration(tmp_path / "same.yaml")) == calibration_digest(BENCH)
-    # Another layout of the same rotation differs by rounding.
+    # A pose that was written in another layout differs by rounding.
     other = with_poses(BENCH, {camera.name: camera.X_BC - 1e-15 for camera in BENCH.cameras})
     assert calibration_digest(other) == calibration_digest(BENCH)
     moved = with_poses(BENCH, {camera.name: camera.X_BC + 1e-5 for camera in BENCH.cameras})

@@ -188,7 +188,7 @@ def test_a_process_that_dies_leaves_a_failed_episode(monkeypatch: pytest.MonkeyP
 
 
 class Here(LocalWorkers):
-    """Runs calls in this process, because another one takes seconds to start."""
+    """Runs calls in this process, because a worker process takes seconds to start."""
 
     def run(self, function: Callable, *arguments: Any) -> Any:
         return function(*arguments)
@@ -224,7 +224,7 @@ def test_evaluates_if_any_seed_can_be_built(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_missing_rendering_is_not_a_failed_episode(monkeypatch: pytest.MonkeyPatch):
-    """A failed episode would never be run again."""
+    """It is an error instead, because a failed episode would never be run again."""
     monkeypatch.setattr(cameras, "can_render", lambda: False)
     looks = PythonPolicy(function="systems.signals:PickPlaceAction")
     chosen = dataclasses.replace(CHOSEN, scenario=Scenario(policy=looks))
@@ -263,7 +263,7 @@ def test_notes_seeds_of_the_training_data(
     scenario = tmp_path / "mine.yaml"
     scenario.write_text(f"Mine: {{policy: !Learned {{weights: {weights_file}}}}}\n")
     monkeypatch.setattr(evaluation, "run_in_worker", lambda _, __, seed, ___: fake_run(seed))
-    # Skip loading the networks.
+    # A stand-in for the built scenario, so that no networks are loaded.
     scene = types.SimpleNamespace(scene=types.SimpleNamespace(success=AddS()))
     monkeypatch.setattr(evaluation, "build_any_chosen", lambda *_: scene)
     monkeypatch.setattr(evaluation, "draw_summary", lambda *_: None)

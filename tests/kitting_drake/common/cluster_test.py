@@ -99,7 +99,7 @@ def test_a_call_runs_in_its_own_process(ray: FakeRay):
 def test_capacity_is_the_number_of_cpus(ray: FakeRay):
     with workers() as there:
         assert there.capacity() == 3
-        # A waiting task makes a cluster grow.
+        # A cluster without CPUs may grow, but only once a task waits: allow one task.
         ray.cpus = {}
         assert there.capacity() == 1
 
@@ -138,7 +138,7 @@ def test_an_error_names_a_node_with_other_versions(monkeypatch: pytest.MonkeyPat
 
 
 def test_an_error_names_a_package_without_a_version():
-    """It is no failure of the episode, which would be kept as its result."""
+    """An episode must not count as failed because a node lacks a package."""
     wanted = {**versions(), "absent": "1.2"}
     outcome = pickle.loads(cluster._answer(wanted, pickle.dumps(("os", "getpid", ()))))
     assert "absent" in outcome.reason

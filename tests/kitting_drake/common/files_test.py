@@ -84,7 +84,7 @@ def test_claim_folder_raises_for_another_runs_folder(tmp_path: Path):
         claim_folder(tmp_path, "settings.json", {"steps": 3, "type": "bfloat16"}, of="run")
     with pytest.raises(UserError, match=r"another run .*type, steps .* order steps, type"):
         claim_folder(tmp_path, "settings.json", {"type": "float32", "steps": 3}, of="run")
-    # A field was added or removed.
+    # The settings have an additional field or lack one.
     known = {"steps": 3, "type": "float32"}
     with pytest.raises(UserError, match=r"another run .*no seed"):
         claim_folder(tmp_path, "settings.json", {**known, "seed": None}, of="run")

@@ -23,7 +23,7 @@ torch.optim.Adam([torch.zeros(1, requires_grad=True)])
 
 @pytest.mark.slow
 def test_an_optimizer_can_be_made_after_rendering():
-    """As in training on a Gymnasium environment: PyTorch's Triton and Mesa each bring an LLVM."""
+    """PyTorch's Triton and Mesa each load an LLVM, and the two must not clash."""
     result = subprocess.run(
         [sys.executable, "-c", RENDER_THEN_TRAIN], capture_output=True, text=True, check=False
     )
@@ -44,7 +44,7 @@ def tell_refusal(connection: Connection) -> None:
     ("start", "refusal"), [("fork", "this process was forked"), ("spawn", "nothing")]
 )
 def test_a_fork_of_a_process_that_rendered_raises(start: str, refusal: str):
-    """It would deadlock on threads that only its parent has."""
+    """The forked process would deadlock, because it waits for threads that only its parent has."""
     require_rendering()
     context = multiprocessing.get_context(start)
     here, there = context.Pipe()

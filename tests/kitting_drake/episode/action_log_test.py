@@ -83,7 +83,7 @@ def test_the_right_action_has_no_error(station: KittingStation, index: int):
 
 def test_place_errors_are_those_of_the_arrival_pose(station: KittingStation):
     pick, place = right_action(station, OBJECT)
-    # With another grasp and a matching place, only the pick is wrong.
+    # If the place moves with the grasp, the object still reaches its goal: only the pick is wrong.
     off = flat(3e-3, -4e-3, math.radians(7.0))
     shifted = [planar(flat(pose.x, pose.y, pose.theta) @ off) for pose in (pick, place)]
     record = Action(station, *shifted).record
@@ -99,7 +99,7 @@ def test_half_a_rotation_is_ignored_for_the_jaws_but_not_for_the_object(station:
     record = Action(station, rotated, place).record
     assert record.pick_angle_error_deg == pytest.approx(0.0, abs=1e-9)
     assert record.place_angle_error_deg == pytest.approx(180.0)
-    # Rotating about the grasp moves the object's middle to the other side.
+    # A half turn about the grasp moves the object's middle to the other side of the grasp.
     (grasp,) = station.scene.objects[OBJECT].grasps
     middle = station.objects[OBJECT].p_BMiddle
     arm = math.hypot(grasp.x - middle[0], grasp.y - middle[1])
@@ -146,7 +146,7 @@ def test_the_lifted_object_is_recorded(station: KittingStation):
     action.go(Mode.CARRY, Mode.LOWER, Mode.RELEASE)
     assert action.record.object == station.scene.objects[2].name
     assert action.record.outcome == "placed"
-    # The errors use the lifted object's initial pose and goal.
+    # Errors refer to the initial pose and the goal of the object that was lifted.
     here, there = (station.scene.objects[index].X_WB.translation() for index in (0, 2))
     assert action.record.pick_position_error_mm > 1e3 * np.linalg.norm(there - here) / 2
     assert action.record.place_position_error_mm > 30.0

@@ -16,7 +16,7 @@ POINTS = np.array([[0.0, 0.0, 0.0], [0.02, 0.02, 0.02]])
 
 @dataclasses.dataclass
 class Cell:
-    """A station of objects at x = 0.3, 0.4, ...; object i fills goal `filled[i]`, or none."""
+    """A fake station: objects are at x = 0.3, 0.4, ...; object i fills goal `filled[i]`, if any."""
 
     goals: tuple[Goal, ...]
     filled: tuple[int | None, ...]
@@ -55,7 +55,7 @@ def goal(*objects: int) -> Goal:
 ONE_LEFT = Cell((goal(0), goal(1)), (0, None))
 ALL_PLACED = Cell((goal(0), goal(1)), (0, 1))
 FOREIGN = Cell((goal(0),), (0, None))
-"""An object without a cavity beside a full kit."""
+"""The kit is full, and the object that is left belongs in no cavity."""
 KEPT = Cell((goal(0), goal(1)), (0, None), kept=frozenset({1}))
 
 
@@ -87,7 +87,7 @@ def test_what_is_left_over_comes_from_the_policy_or_else_from_the_true_state():
     assert found.objects == (Position(pytest.approx(0.41), pytest.approx(0.01)),)
     assert found.cavities == (Position(pytest.approx(0.61), pytest.approx(-0.19)),)
     assert found.text == "1 object at (0.41, 0.01) and 1 cavity at (0.61, -0.19)"
-    # A foreign object is no object of a goal.
+    # An object that belongs to no goal is not reported.
     assert find_left_over(FOREIGN, None).text == ""  # type: ignore[arg-type]
     report = LeftOver(objects=((0.5, 0.1), (0.6, 0.1)))
     told: Any = dataclasses.replace(ONE_LEFT, action=dataclasses.replace(STOP, left_over=report))

@@ -48,7 +48,7 @@ def test_each_logged_action_has_the_policys_observation(log: EpisodeLog):
     assert arrays["observation_height"].shape == (1, 160, 320)
     begun = int(np.searchsorted(arrays["time"], arrays["action_time"][0]))
     assert arrays["mode"][begun] == Mode.APPROACH
-    # The hand grips at the pick, where a tool is.
+    # The hand grips at the pick, where o_t shows a tool.
     grips = arrays["joint_position"][arrays["mode"] == Mode.CLOSE][-1]
     assert grips[:2] == pytest.approx(arrays["pick"][0, :2], abs=1e-3)
     row, col = ((arrays["pick"][0, :2] - (0.25, -0.5)) / 0.003125).astype(int)

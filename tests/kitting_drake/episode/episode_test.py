@@ -157,7 +157,7 @@ def test_initially_filled_goals_count_unless_the_episode_times_out():
 
 @pytest.mark.parametrize("ends", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_end_at_success_ends_the_episode_without_another_action(ends: bool):
-    """With two tries per tool, the planner could request another action."""
+    """Two tries per tool would allow the planner to request another action."""
     task = dataclasses.replace(ONE_TOOL, tries=2)
     rig = build(dataclasses.replace(BLIND, task=task, end_at_success=ends))
     modes: list[Mode] = []
@@ -242,18 +242,18 @@ def test_a_policy_is_called_only_after_the_planner_has_observed(monkeypatch: pyt
     rig = build(scenario)
     asked: list[tuple[Mode, int]] = []
     result = rig.run(lambda event: asked.append((event.mode, len(stub.seen))), seconds=30.0)
-    # It is called once before each of the two modes that follow OBSERVE, and at no other time.
+    # The policy is called once before each of the two modes that follow OBSERVE, and never else.
     assert asked[0] == (Mode.APPROACH, 1)
     assert {count for mode, count in asked[:-2]} == {1}
     assert asked[-2:] == [(Mode.DONE, 2), (Mode.DONE, 2)]
     assert (result.actions, result.missed_grasps, result.failure) == (1, 1, None)
     assert [action.outcome for action in result.actions_taken] == ["missed"]
     assert result.objects[0].cause == "missed grasp"
-    # It saw the block, 50 mm high, where it stands, but not the hand.
+    # The second observation shows the block, 50 mm high, where it stands, but not the hand.
     seen = stub.seen[1]
     row, col = np.round(seen.grid.to_pixel([0.45, 0.08])).astype(int)
     block = seen.height[row - 8 : row + 9, col - 8 : col + 9]
-    assert np.count_nonzero(block) > 20  # These small images do not cover every pixel.
+    assert np.count_nonzero(block) > 20  # The small camera images leave gaps in the height map.
     np.testing.assert_allclose(block[block > 0], 0.05, atol=0.004)
     assert seen.height.max() < 0.07
 

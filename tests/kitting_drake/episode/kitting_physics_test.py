@@ -25,7 +25,7 @@ from tests.kitting_drake.rig import Rig, build_rig
 
 TOOLS = Kitting().tools
 THRESHOLD = 0.0035
-"""Success by section IV-C of the paper, in m."""
+"""An ADD-S below this counts as success, by section IV-C of the paper, in m."""
 
 
 def run(
@@ -76,7 +76,7 @@ def test_the_oracle_kits_all_four_tools_reproducibly():
 
 @pytest.mark.slow
 def test_sleep_does_not_change_the_result():
-    """A tool is kitted beside a resting one, which is frozen or not."""
+    """Kits a tool beside a resting one; with sleep, the resting one is frozen."""
     task = ArrangedKitting(
         tools={
             "combination_wrench": TablePose(x=0.42, y=0.14),
@@ -99,7 +99,7 @@ def test_sleep_does_not_change_the_result():
 
 
 class Seated:
-    """Awake tools at or near their cavities in a rotated kit; the hand does not move."""
+    """A simulation without sleep of tools at or near their cavities; the hand does not move."""
 
     def __init__(self, *names: str) -> None:
         task = ArrangedKitting(
@@ -138,7 +138,7 @@ def test_a_tool_released_beside_its_place_slips_into_its_cavity(name: str, sign:
     seated = Seated(name)
     (item,) = seated.station.scene.objects
     height = item.p_BPoints[:, 2].max()
-    # 1 mm and 1 degree off; the bottom is 10 mm below the top of the block.
+    # The tool is 1 mm and 1 degree off; its bottom is 10 mm below the top of the block.
     offset = [sign * 1e-3 * np.sqrt(0.5), 1e-3 * np.sqrt(0.5), height - 0.010]
     rotation = RollPitchYaw(0, 0, np.deg2rad(sign * 1.0))
     seated.put(0, RigidTransform(rotation, offset))
@@ -161,7 +161,7 @@ def test_tools_in_their_cavities_do_not_creep():
     seated.simulator.AdvanceTo(11.0)
     for index, item in enumerate(seated.station.scene.objects):
         moved = before[index].InvertAndCompose(seated.pose(index))
-        # At any point of the tool.
+        # The creep is the largest displacement of the tool's points.
         points = item.p_BPoints[:200]
         creep = np.linalg.norm(moved.multiply(points.T).T - points, axis=1).max()
         assert creep < 2e-4, item.name
@@ -169,7 +169,7 @@ def test_tools_in_their_cavities_do_not_creep():
 
 
 class Misjudged(ArrangedKitting):
-    """The annotated grasp is 8 degrees off, so the closing jaws rotate the tool. A tool that is
+    """The grasp is annotated 8 degrees off, so the closing jaws rotate the tool. A tool that is
     rotated by 5 degrees slips in without a search."""
 
     def make_scene(self, **more) -> Scene:

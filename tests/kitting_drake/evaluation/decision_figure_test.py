@@ -70,7 +70,7 @@ def test_no_gripper_is_drawn_if_the_policy_stops(observation: Observation, pictu
 
 
 def test_pictures_show_what_is_not_seen(observation: Observation):
-    """Out of view is grey, and unseen in view is striped; both in two panels."""
+    """Pixels out of view are grey; unseen ones within the view are striped. Both in two panels."""
     valid, in_view = np.ones((2, *GRID.shape), bool)
     valid[:, 10:], in_view[:, 30:] = False, False
     partly = dataclasses.replace(observation, valid=valid, in_view=in_view)
@@ -102,6 +102,6 @@ def test_the_maps_alone_are_as_wide_as_asked(observation: Observation):
             pictures.append(np.asarray(picture.convert("RGB")))
     assert pictures[0].shape[1] == 400
     changed = (pictures[0] != pictures[1]).any(axis=(0, 2))
-    # The pick map is on the left.
+    # The pictures differ only in the pick map, which is on the left.
     assert changed[:200].any()
     assert not changed[204:].any()

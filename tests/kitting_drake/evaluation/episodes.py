@@ -24,7 +24,10 @@ def make_object(
     height_error_mm: float = 0.0,
     angle_error_deg: float = 1.0,
 ) -> ObjectResult:
-    """An object that succeeds below an ADD-S of 3.5 mm; None: no goal was left for it."""
+    """The result of an object, a success if `error_mm` (its ADD-S) is below 3.5.
+
+    If `error_mm` is None, no goal was left for the object.
+    """
     success = error_mm is not None and error_mm < 3.5
     is_strict = abs(height_error_mm) <= 2 and abs(angle_error_deg) <= 20
     return ObjectResult(

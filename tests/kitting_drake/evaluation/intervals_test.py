@@ -14,7 +14,7 @@ def test_proportion_interval():
 
 
 def test_mean_interval_of_partial_rewards():
-    # t(0.975, 3) = 3.1824, standard error 0.1 / sqrt(3).
+    # Student's t(0.975) with 3 degrees of freedom is 3.1824; the standard deviation is 0.0816497.
     low, high = mean_interval([0.4, 0.5, 0.5, 0.6])
     assert (low + high) / 2 == pytest.approx(0.5)
     assert (high - low) / 2 == pytest.approx(3.1824 * 0.0816497 / 2, rel=1e-4)

@@ -55,6 +55,6 @@ def test_draw_summary(
 def test_categories_have_distinct_styles():
     looks = [look for look, _ in zip(_looks(), range(21), strict=False)]
     assert len(set(looks)) == 21
-    # Bars show no line style, and curves no hatch.
+    # Bars are told apart by colour and hatch, curves by colour and line style.
     assert len({(look.colour, look.hatch) for look in looks}) == 21
     assert len({(look.colour, look.line) for look in looks}) == 21

@@ -80,7 +80,7 @@ def test_failed_episodes_count_zero():
 
 
 def test_needless_actions_are_counted():
-    """The action is on a distractor, or on an object for which no goal is left."""
+    """An action is needless if its object is a distractor, or one for which no goal is left."""
     episodes = [make_episode(0, [1.0, 9.0]), make_episode(1, [1.0, 1.0])]
     assert summarised(episodes)["needless_actions"] == 0
     episodes[0]["actions_taken"][0]["object"] = "distractor_1"
@@ -137,7 +137,7 @@ def test_other_measures_have_rates():
 
 
 def test_ambiguous_successes_are_not_strict():
-    """ADD-S tolerates a flat object that protrudes or is reversed."""
+    """A flat object that protrudes or lies reversed can pass by ADD-S, but is no strict success."""
     objects = [
         make_object("cup", 1.0, height_error_mm=2.5),
         make_object("bolt", 1.0, angle_error_deg=178.0),
@@ -159,7 +159,7 @@ def test_objects_without_a_goal_are_excluded():
     assert list(summary["categories"]) == ["cup"]
     assert (summary["success_rate"], summary["causes"]) == (1.0, CAUSES)
     assert summary["ci95"] == pytest.approx(proportion_interval(1, 1))
-    # Its action has pick errors only.
+    # The object without a goal has pick errors, but no place errors.
     assert summary["action_errors"]["place_position_error_mm"]["max"] == pytest.approx(2.0)
 
 
@@ -177,7 +177,7 @@ def test_intervals_of_partial_rewards_are_over_episodes():
 
 
 def test_intervals_of_dependent_objects_are_over_episodes():
-    """Even if the rewards are shares of the objects, as here."""
+    """So they are even where an episode's reward is the fraction of its objects that succeed."""
     chosen = dataclasses.replace(CHOSEN, scenario=Scenario(task=StackBlockPyramid()))
     episodes = [make_episode(seed, [1.0, 9.0 if seed % 2 else 1.0]) for seed in range(6)]
     summary = summarise(episodes, chosen, PoseWithin(), wall_seconds_total=1.0)

@@ -89,7 +89,7 @@ def test_the_lines_below_the_table_of_an_episode():
 
 
 def test_the_text_of_a_failure_is_printed_unchanged():
-    """Its text is no markup; as markup, this one would be invalid."""
+    """The console must not read a failure's text as markup; as markup, this one is invalid."""
     console = Console(width=200)
     with console.capture() as shown:
         print_episode(console, make_result(0, [], failure="KeyError: [/x]"))

@@ -71,7 +71,7 @@ def test_targets_are_reached_and_limited(path: Path):
         assert (reward, terminated, truncated) == (0.0, False, False)
     assert info["seconds"] == 0.5
     np.testing.assert_allclose(observation["observation.state"], target, atol=2e-3)
-    # The limit of x is 1.7 m/s.
+    # The target is out of reach within a step: x may move at 1.7 m/s.
     far = target + np.array([0.5, 0, 0, 0, 0], np.float32)
     before = observation["observation.state"][0]
     observation, *_ = environment.step(far)
@@ -131,14 +131,14 @@ def test_frames_are_taken_at_equal_times(monkeypatch: pytest.MonkeyPatch):
     assert len(times) == 16
     np.testing.assert_allclose(times, np.arange(16) / 15, atol=0.5 / 128 + 1e-9)
     frames = recorder.frames()
-    # An action is the command at the next frame.
+    # The action of a frame is the command at the next frame.
     np.testing.assert_array_equal(frames.action[:-1, 0], np.float32(times[1:]))
     assert frames.reward.sum() == 1.0 and frames.reward[7] == 1.0
     assert frames.success.tolist() == [False] * 7 + [True] * 9
 
 
 def test_a_closing_force_is_a_smaller_opening(path: Path):
-    # 30 N of each finger at 800 N/m: 37.5 mm of each finger.
+    # 30 N at 800 N/m is 37.5 mm for each finger.
     view = object.__new__(JointView)
     values = {
         "commanded": np.array([0.1, 0.2, 0.3, 0.4, *np.zeros(8)]),

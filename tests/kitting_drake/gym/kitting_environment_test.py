@@ -59,7 +59,7 @@ def test_all_are_registered():
     names |= {"StackBlockPyramid", "PalletizingBoxes", "Scenario"}
     registered = {spec.name for spec in gymnasium.registry.values() if spec.namespace}
     assert names <= registered
-    # Their scenarios exist; none is built.
+    # Checks that each environment's scenario exists; none is built.
     for name in kitting_drake.gym.SCENARIOS:
         gymnasium.make(f"kitting_drake/{name}-v0").close()
 
@@ -74,7 +74,7 @@ def test_a_file_in_the_working_directory_replaces_no_environment(
 
 @pytest.mark.slow
 def test_gymnasiums_own_checks_pass(small: Path):
-    # Rendering is tested below, because theirs makes many pictures.
+    # Gymnasium's check of rendering makes many pictures; the next test checks one.
     check_env(make(small, cameras=True).unwrapped, skip_render_check=True)
 
 
@@ -137,12 +137,12 @@ def test_an_episode_equals_that_of_evaluate(small: Path, monkeypatch: pytest.Mon
     assert total == expected["success_rate"] == 1.0
     assert len(info["failed_picks"]) == 1
     assert [attempt["outcome"] for attempt in info["history"]] == ["missed", "placed"]
-    # Every goal is filled, so the agent need not stop.
+    # All results are equal: every goal is filled, so the episode ends without a stop.
     assert {key for key in expected if info.get(key) != expected[key]} == {"policy", "wall_seconds"}
 
 
 def test_each_step_renders_one_observation(small: Path, monkeypatch: pytest.MonkeyPatch):
-    """More renderings would make a step costlier than an action in `evaluate`."""
+    """Otherwise a step would be costlier than an action in `evaluate`."""
     count = []
     render = HeightmapProjector._CalcObservation
 
@@ -276,7 +276,7 @@ def test_a_step_costs_what_an_action_costs_in_evaluate(monkeypatch: pytest.Monke
     for seed in range(2, 10):
         start = time.process_time()
         if seed % 2:
-            # Alternate the order, because the first warms the caches of the second.
+            # Alternate the order, because the first run warms the caches for the second.
             total, info = played(environment, Recorder(), seed)
             middle = time.process_time()
             result = evaluated(path, Recorder(), seed, monkeypatch, "KittingUnseenToolsets")
@@ -288,7 +288,7 @@ def test_a_step_costs_what_an_action_costs_in_evaluate(monkeypatch: pytest.Monke
             here, there = here + time.process_time() - middle, there + middle - start
         assert total == result["success_rate"]
         for own, other in zip(info["objects"], result["objects"], strict=True):
-            # o_t is taken one step earlier, so results are identical only if nothing moved then.
+            # The agent's o_t is one time step older, so an object may have moved a little since.
             assert own["add_s_mm"] == pytest.approx(other["add_s_mm"], abs=0.01)
     print(f"a step costs {here / there:.3f} of an action in evaluate")
     assert here / there < 1.1

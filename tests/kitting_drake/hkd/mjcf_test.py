@@ -59,7 +59,7 @@ def test_the_prisms_fill_the_block(kit: Kit):
     solid = Manifold()
     for prism in block_prisms(mesh.vertices, mesh.faces):
         solid += Manifold.hull_points(prism)
-    # The steps that replace the bevels add about as much volume as they remove.
+    # Steps replace the bevels; they add about as much volume as they remove.
     assert solid.volume() == pytest.approx(mesh.volume, rel=1e-4)
     model = compiled(kit_mjcf(kit.sdf), kit.sdf.parent)
     assert model.nq == 0

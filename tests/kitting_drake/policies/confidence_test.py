@@ -1,4 +1,4 @@
-"""The confidence of decisions: its fit, and what it is made of."""
+"""The confidence of decisions: how it is fitted, and the evidence from which it is computed."""
 
 import dataclasses
 
@@ -18,7 +18,7 @@ from tests.kitting_drake.policies.matching.regions.visibility_test import kit_an
 
 
 def drawn(seed: int, count: int = 2000) -> list[Judged]:
-    """Decisions that succeed with the probability of a logistic law of two facts."""
+    """Random decisions; the chance of success is a logistic function of two features, a and b."""
     random = np.random.default_rng(seed)
     facts = random.normal(size=(count, 2))
     probability = 1 / (1 + np.exp(-(1.0 + 3 * facts[:, 0] - 2 * facts[:, 1])))
@@ -39,7 +39,7 @@ def test_the_fit_finds_the_law_and_is_calibrated():
     assert summary.calibration_error < 0.03
     assert summary.wrong_answers < 0.05
     assert sum(count for *_, count in summary.bins) == summary.decisions == 2000
-    # A confidence that is always high is told.
+    # The calibration error reveals a confidence that is always high.
     assert summarize(others, [0.98] * len(others), 0.9).calibration_error > 0.2
 
 
@@ -57,7 +57,7 @@ def test_a_poor_fit_is_less_likely_to_succeed():
     )
     good = kit_and_bar(None)
     image = good.image.copy()
-    image[3, 78:88, 220:262] = 0.015  # Shorter and wider than its recess.
+    image[3, 78:88, 220:262] = 0.015  # The object is shorter and wider than its recess.
     poor = policy.decide(dataclasses.replace(good, image=image)).geometry
     best = policy.decide(good).geometry
     assert best is not None and reliability.confidence(best) > 0.9

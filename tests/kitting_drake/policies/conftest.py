@@ -1,4 +1,4 @@
-"""Every test starts from the same random state, on one thread because tests run in parallel."""
+"""Gives every test the same random state, and one thread, because tests run in parallel."""
 
 import pytest
 import torch

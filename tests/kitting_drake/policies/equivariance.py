@@ -10,13 +10,13 @@ from kitting_drake.policies.networks.layers.correlation import lift
 
 
 def distance_from_middle(side: int) -> Tensor:
-    """(side, side), in units of half the side."""
+    """(side, side): each pixel's distance from the image's middle, in units of half the side."""
     offset = torch.arange(side, dtype=torch.float32) - side // 2
     return torch.hypot(offset[:, None], offset[None, :]) / (side / 2)
 
 
 def smooth_image(side: int, *, seed: int = 0, channels: int = 4, blur: int = 6) -> Tensor:
-    """(1, channels, side, side): random, without detail below `blur` pixels, zero at the edge."""
+    """A random image (1, channels, side, side), blurred by `blur` pixels, zero at the edge."""
     generator = torch.Generator().manual_seed(seed)
     reach = 3 * blur
     noise = torch.randn(channels, 1, side + 2 * reach, side + 2 * reach, generator=generator)

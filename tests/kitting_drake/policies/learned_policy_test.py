@@ -18,7 +18,7 @@ from kitting_drake.policies.networks.methods import make_networks
 from kitting_drake.policies.stages import SubPixel
 from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
 
-# Unlike the defaults, and all numbers differ.
+# All numbers differ from each other and from the defaults, so that none can be confused.
 GRID = PixelGrid(x_min=0.3, y_min=-0.2, resolution=0.004, rows=97, cols=129, z_min=0.02, z_max=0.3)
 PICK = (61.3, 22.4)
 GOAL = np.array([40, 90])
@@ -27,7 +27,7 @@ BIN = math.tau / N
 ROTATION = 19
 THETA = math.radians(62.0)
 ARMS = ((0, 0), (0, 18), (9, 0))
-"""The (row, col) offsets from the pick of the encodings' blobs, one per channel."""
+"""The (row, col) offset of the blob in each channel of an encoding, relative to the pick."""
 
 
 def blob(shape: tuple[int, int], centre: tuple[float, float] | NDArray[np.float64]) -> Tensor:
@@ -36,7 +36,7 @@ def blob(shape: tuple[int, int], centre: tuple[float, float] | NDArray[np.float6
 
 
 def linear(shape: tuple[int, ...], label: tuple[float, ...]) -> Tensor:
-    """The optimal logits for an interpolated label."""
+    """The logits that minimise the loss for a label between the entries, which is interpolated."""
     offsets = torch.meshgrid(*map(torch.arange, shape), indexing="ij")
     shares = [(1 - (n - at).abs()).clamp(min=0) for n, at in zip(offsets, label, strict=True)]
     return torch.stack(shares).prod(0).double().log().float()
@@ -50,7 +50,7 @@ def rotated(vector: tuple[float, float] | NDArray[np.float64], angle: float) -> 
 
 
 class Known(Networks):
-    """Networks with given predictions. Their encodings match only at GOAL."""
+    """Networks that make given predictions. Scene and crop encodings match only at GOAL."""
 
     def __init__(
         self,
@@ -119,7 +119,7 @@ def test_refinement_goes_beyond_pixels_and_bins():
 
 @pytest.mark.parametrize("bins", [0, ROTATION, 40, N - 1])
 def test_the_offset_of_a_refined_pick_is_rotated_to_the_place(bins: int):
-    """The motion of the crop's centre pixel is applied to the refined pick."""
+    """The place is that of the crop's centre pixel plus the pick's offset from it, rotated."""
     at_the_pixel, beside_it = (
         decide(Known(pick=pick, rotation=bins * BIN), continuous=True) for pick in ((61, 22), PICK)
     )
@@ -167,14 +167,14 @@ def test_stops_when_the_log_odds_are_below_the_threshold(
     assert policy.log_odds(observation()) == log_odds
     found = policy.decide(observation())
     assert (found.stop, found.log_odds) == (stop, log_odds)
-    # It still reports the action that it would have taken.
+    # Even if it stops, the decision holds the action that the policy would have taken.
     np.testing.assert_allclose(
         found.place_pixel, GOAL + rotated((0.3, 0.4), ROTATION * BIN), atol=0.1
     )
     action = policy(observation())
     assert action == (PickPlaceAction(stop=True, reason="done") if stop else found.action)
     assert action.heights is None
-    # Where the episode ends by itself it is not asked.
+    # Without the stage `StopRule`, the policy never stops.
     unasked = LearnedPolicy(networks, orientations=N, stages=[SubPixel()])
     assert unasked(observation()) == dataclasses.replace(found.action, stop=False, reason="")
 
@@ -189,12 +189,12 @@ def test_recovers_an_interpolated_position(pixel: tuple[float, float]):
 
 
 def test_a_position_does_not_depend_on_other_peaks():
-    """Two objects may be equally good picks, and the mean of both is none."""
+    """Two objects may be equally good picks, but the mean of their positions is no good pick."""
     two = (linear((9, 9), (2, 2)).exp() + linear((9, 9), (2, 6)).exp()).log()
     np.testing.assert_allclose(expected_position(two, (2, 2)), (2, 2), atol=1e-5)
 
 
-# The first bin, the corner, and the label relative to them.
+# The window's first bin and its corner pixel, and the label relative to them.
 PLACEMENTS = [
     (10, (5, 7), (2.3, 3.6, 4.4)),
     (-4, (0, 0), (3.0, 0.0, 0.4)),
@@ -244,7 +244,7 @@ def test_a_read_only_image_is_accepted_and_not_changed():
 
 
 class Distracted(Known):
-    """Networks whose encodings match best in the padding, below and beside the image."""
+    """Networks whose encodings match best in the padding, which is below and beside the image."""
 
     def encode_scene(self, image: Image) -> Tensor:
         scene = super().encode_scene(image)

@@ -1,4 +1,4 @@
-"""The outside of the block, fits of single tools, depths, and walls that cannot be printed."""
+"""Options of the block: outer shape, fits of single tools, depths; also walls that are too thin."""
 
 import dataclasses
 import re
@@ -64,7 +64,7 @@ def test_a_gridfinity_base(tmp_path: Path):
             np.testing.assert_allclose(extent(foot), side, atol=0.01)
             middle = np.array(foot.bounds()).reshape(2, 2).mean(axis=0)
             np.testing.assert_allclose((middle + GAP / 2) % PITCH, PITCH / 2, atol=1e-3)
-    # A bin's corners are rounded.
+    # The block's corners are rounded, like those of a Gridfinity bin.
     corner = CrossSection.square((1.0, 1.0))
     assert (block.slice(30.0) ^ corner).is_empty()
     assert made.split is not None
@@ -102,14 +102,14 @@ def test_a_tool_may_stand_out():
     parameters = KitParameters(always_nested=True, stand_out=0.004)
     for tool, pose in zip(tools, layout_kit(tools, parameters).poses, strict=True):
         assert pose.z + tool.height == pytest.approx(parameters.height + 0.004)
-    # A lower block will do.
+    # A block of 12 mm is high enough for a tool of 8 mm that stands out by 4 mm, but not by 5 mm.
     layout_kit(tools, KitParameters(always_nested=True, stand_out=0.004, height=0.012))
     with pytest.raises(UserError, match=r"'plate_90x40x8' is 8\.0 mm high.* by at most 4\.0 mm"):
         layout_kit(tools, KitParameters(always_nested=True, stand_out=0.005))
 
 
 def two_plates(wall: float, compensation: float = 0.0) -> Design:
-    """Two cavities of 94 by 44 mm with a wall between them, in metres."""
+    """Two cavities of 94 by 44 mm, with a wall of `wall` (m) between them."""
     parameters = KitParameters(length=0.12, width=0.12, always_nested=True, lead_in=0.0)
     offset = 0.022 + wall / 2
     poses = [CavityPose(0.0, sign * offset, 0.042) for sign in (-1, 1)]

@@ -1,12 +1,12 @@
-"""Exports of kits without pictures."""
+"""A fixture that exports kits without their pictures."""
 
 import pytest
 
 
 @pytest.fixture(autouse=True)
 def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Drawing its picture takes most of the time of a kit's export.
+    """Replaces a kit's picture by no data, because drawing it takes most of an export's time.
 
-    The module's own fixtures run before this one, so their kits have a picture.
+    Module-scoped fixtures run before this one, so the kits that they export do have a picture.
     """
     monkeypatch.setattr("kitting_drake.hkd.fabrication.export.picture_png", lambda _: b"")

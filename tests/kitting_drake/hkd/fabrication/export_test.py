@@ -53,7 +53,7 @@ def own_tool(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def bar(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a rectangular tool, which leaves no room on a tight block."""
+    """The folder of a rectangular tool, around which a tight block has no room for a label."""
     folder = tmp_path_factory.mktemp("bar")
     (folder / "bar.svg").write_text(
         '<svg xmlns="http://www.w3.org/2000/svg" width="160mm" height="14mm" viewBox="0 0 160 14">'
@@ -65,7 +65,7 @@ def bar(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory: pytest.TempPathFactory, own_tool: Path) -> Path:
-    """The folder of a kit with a user tool, twice, and one of the project's tools."""
+    """The folder of a kit with two copies of a user's tool and one of the project's tools."""
     folder = tmp_path_factory.mktemp("plain") / "kit"
     export_kit(KitRequest((str(own_tool), "claw_hammer", str(own_tool)), folder))
     return folder
@@ -149,7 +149,7 @@ def wall_distances(folder: Path) -> tuple[float, float]:
     floors = sorted({height - depth for depth, _ in outlines})
     for floor in floors:
         for z in (floor + 0.15, top - 0.15):
-            # A slice along another cavity's floor is ambiguous.
+            # A slice in the plane of any cavity's floor is ambiguous.
             while min(abs(z - other) for other in floors) < 0.02:
                 z += 0.03
             walls = walls_of_block(folder, z)
@@ -164,7 +164,7 @@ def wall_distances(folder: Path) -> tuple[float, float]:
 def test_the_printed_walls_match_simulation_and_drawing(plain: Path):
     assert stl(plain).is_watertight
     to_sdf, to_dxf = wall_distances(plain)
-    # Points are 0.02 mm apart, so a deviation below half of that is not resolved.
+    # Points are 0.02 mm apart, so deviations below 0.01 mm cannot be told from zero.
     assert max(to_sdf, to_dxf) < 0.015
 
 
@@ -245,7 +245,7 @@ def test_notches_keep_their_distance():
 @pytest.mark.parametrize("apart", [0.001, 0.004])
 @pytest.mark.parametrize("inside", [False, True])
 def test_notches_of_one_tool_have_a_wall_between_them(apart: float, inside: bool):
-    """Notches around a corner of the tool need a wall; inside the cavity there is none anyway."""
+    """Two notches need a wall of 3 mm between them, except within the cavity, which is open."""
     one = CrossSection.square((0.02, 0.02))
     other = one.translate((0.02 + apart, 0.0))
     side = 0.1 if inside else 0.01

@@ -52,9 +52,9 @@ def assert_apart(sheet: FoamSheet) -> None:
     ("size", "kit_size", "count"),
     [
         ((600.0, 400.0), (190.0, 120.0), 10),
-        # Two columns upright and one turned: neither way alone has so many.
+        # Two columns of upright kits and one of turned kits hold more than columns of one kind.
         ((100.0, 60.0), (30.0, 20.0), 10),
-        # A pinwheel.
+        # Four kits fit only if they are arranged like a pinwheel.
         ((50.0, 50.0), (30.0, 20.0), 4),
     ],
 )
@@ -92,7 +92,7 @@ def test_drawings_have_each_outline_at_its_place():
     for outline in layers["CAVITIES_17.00_MM_DEEP"]:
         x, y = outline.T
         area = (x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2
-        # Turned, never mirrored.
+        # The area is positive: outlines are turned, but never mirrored.
         assert area == pytest.approx(175.0)
     document = ezdxf.read(io.StringIO(sheet_dxf(sheet)))
     assert not document.audit().errors

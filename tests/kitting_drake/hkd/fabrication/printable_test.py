@@ -1,4 +1,4 @@
-"""What slicers and cutters check, on written kits."""
+"""Makes the checks of slicers and cutters on the files of kits."""
 
 import xml.etree.ElementTree as ElementTree
 import zipfile
@@ -32,13 +32,13 @@ def thin(shape: CrossSection) -> list[CrossSection]:
 
 
 def check_solid(path: Path) -> None:
-    """Walls of at least 1.2 mm, and nothing printed on air."""
+    """Checks that walls are at least 1.2 mm thick, and that nothing is printed on air."""
     solid = solid_of(path)
     below = solid.slice(0.05)
     top = solid.bounding_box()[5]
     for z in np.arange(0.45, top - 0.1, 1.7):
         layer = solid.slice(z)
-        # Letters are engraved in the uppermost 0.6 mm.
+        # The uppermost 0.6 mm have engraved letters, with thin walls between them.
         if z < top - 0.8:
             assert not thin(layer), f"{path.name} at {z:g} mm"
         assert all((part ^ below).area() > 1e-3 for part in layer.decompose())
@@ -87,7 +87,7 @@ def test_slicers_and_cutters_find_nothing(gridfinity: bool, tmp_path: Path):
 
 
 def check_letters(folder: Path) -> None:
-    """Letters fill the engraved ones, in the whole block and in its pieces."""
+    """Checks that the printed letters fill the engraved ones, in the block and in its pieces."""
     letters, whole = (trimesh.load_mesh(folder / name) for name in ("labels.stl", "kit.stl"))
     assert letters.is_watertight
     block, filled = (

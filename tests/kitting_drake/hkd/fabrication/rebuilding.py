@@ -13,7 +13,10 @@ from kitting_drake.hkd.fabrication.splitting.pieces import Split
 
 
 def assert_rebuilds(whole: Manifold, parts: list[Manifold], found: Split) -> None:
-    """Pieces agree with the whole outside the joints: in volume, and in sections by 0.05 mm."""
+    """Checks that the joined pieces equal the whole block, except in the joints.
+
+    Their volumes agree, and their sections agree to 0.05 mm.
+    """
     zone = united(j.outline.offset(found.play + 0.05, JoinType.Miter) for j in found.joints)
     height = whole.bounding_box()[5]
     joints = Manifold.extrude(zone, height + 2).translate((0, 0, -1))
@@ -29,7 +32,7 @@ def assert_rebuilds(whole: Manifold, parts: list[Manifold], found: Split) -> Non
 
 
 def assembled(folder: Path) -> list[Manifold]:
-    """The pieces of a kit's folder at their places, read from their STL files."""
+    """The pieces of a kit's block, read from their STL files and moved to their places."""
     parts = []
     for number, piece in enumerate(json.loads((folder / "kit.json").read_text())["pieces"], 1):
         assert piece["file"] == f"piece_{number}.stl"

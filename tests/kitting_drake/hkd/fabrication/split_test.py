@@ -57,7 +57,7 @@ def test_pieces_rebuild_the_block():
     assert_rebuilds(whole, [piece.body for piece in found.pieces], found)
     for z in (1.0, 20.0, 35.0):
         assert not [part for piece in found.pieces for part in thin(piece.body.slice(z))]
-    # Pieces can be lowered onto their neighbours in their order.
+    # The pieces can be assembled in their order, each lowered onto those before it.
     assert all(joint.owner < joint.other for joint in found.joints)
     pairs = {(joint.owner, joint.other) for joint in found.joints}
     assert {(0, 1), (2, 3)} <= pairs
@@ -74,7 +74,7 @@ def test_a_cut_passes_between_cavities():
 
 
 def test_a_cut_crosses_a_cavity_rather_than_a_thin_wall():
-    """The wall of 2 mm is where the cut would be shortest, and half of it would be too thin."""
+    """The shortest cut would halve a wall of 2 mm, and a wall of 1 mm is too thin."""
     openings = [Opening(box(5, 5, 120, 90), 10.0), Opening(box(127, 5, 120, 90), 10.0)]
     _, found = split(252.0, 100.0, openings, (160.0, 160.0))
     for piece in found.pieces:
@@ -111,7 +111,7 @@ def test_a_bed_that_is_too_small():
 
 
 def test_cuts_go_between_feet_or_straight_through_them():
-    """A cavity's wall is beside the line between the feet."""
+    """The second block has a cavity whose wall is too near to the line between the feet."""
     size, bed = (251.5, 83.5), (150.0, 150.0)
     feet = foot_sections(size)
     for openings in ([], [Opening(box(126.3, 10, 100, 60), 10.0)]):

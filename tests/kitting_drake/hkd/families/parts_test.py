@@ -34,7 +34,7 @@ def test_a_part_is_what_its_name_says(kind: str):
 
 @pytest.mark.parametrize("kind", PART_KINDS)
 def test_jaws_close_on_what_a_parts_grasp_says(kind: str):
-    """At the rim of a large ring, one pad is inside."""
+    """A large ring is held by its rim: one pad is inside the ring, the other outside."""
     for length, shares in itertools.product((0.015, 0.04, 0.35), ((0.0, 0.0), (1.0, 1.0))):
         tool = sized_part(kind, length, shares)
         grasp = tool.grasp

@@ -42,7 +42,7 @@ def without_order(obj: bytes) -> list[tuple[str, ...]]:
     faces = []
     for line in lines:
         if line.startswith("f "):
-            # Hulls have no normals.
+            # The files of collision hulls have no normals.
             pairs = [corner.partition("//")[::2] for corner in line.split()[1:]]
             corners = [points[int(v) - 1] + (normals[int(n) - 1] if n else "") for v, n in pairs]
             first = corners.index(min(corners))

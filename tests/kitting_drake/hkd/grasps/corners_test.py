@@ -18,7 +18,7 @@ def triangles(solid: Manifold) -> NDArray[np.float64]:
 
 
 def star(points: int, outer: float, inner: float) -> Manifold:
-    """20 mm high, in mm; a polygon if `inner` is on its sides."""
+    """A prism, 20 mm high, whose base is a star with corners at two radii, in mm."""
     angles = np.arange(2 * points) * math.pi / points
     radii = np.where(np.arange(2 * points) % 2, inner, outer)
     corners = np.column_stack([radii * np.cos(angles), radii * np.sin(angles)])
@@ -32,12 +32,12 @@ def polygon(sides: int, radius: float) -> Manifold:
 @pytest.mark.parametrize(
     ("solid", "sides", "width"),
     [
-        # From a corner to the opposite side.
+        # The jaws hold a corner and the opposite side.
         (polygon(3, 34.0), 3, 0.051),
         pytest.param(
             *(polygon(5, 31.0), 5, 0.031 * (1 + math.cos(math.pi / 5))), marks=pytest.mark.slow
         ),
-        # A star, by two of its arms or by a point and the opposite notch.
+        # The jaws hold a star by two of its arms, or by a point and the opposite notch.
         (star(5, 30.0, 14.0), 10, None),
     ],
 )
@@ -67,7 +67,7 @@ def test_a_corner_beside_the_opposite_face_would_turn():
     corner += np.abs(np.arange(columns) - 17)[:, None] * 0.001 + 0.05
     face[:] = 0.0
     assert corner_cost(face, corner, 0.0005, 0.0003) == pytest.approx(0.5)
-    # The face ends before the corner.
+    # The face recedes opposite the corner, so it is not held there.
     face[16:] = -0.005
     assert corner_cost(face, corner, 0.0005, 0.0003) is None
     # A tool that tapers toward one end of the pads, and one that tapers too much.
@@ -75,6 +75,6 @@ def test_a_corner_beside_the_opposite_face_would_turn():
         taper = np.full((columns, 4), slope * 0.0005) * np.arange(columns)[:, None]
         found = corner_cost(-taper, taper, 0.0005, 0.0003)
         assert found == (cost if cost is None else pytest.approx(cost, abs=0.05))
-    # Two corners: opposite each other, and beside each other.
+    # Two corners can be held if they are opposite each other, but not if they are offset.
     assert corner_cost(-corner, corner, 0.0005, 0.0003) == pytest.approx(2.5)
     assert corner_cost(-np.roll(corner, 5, axis=0), corner, 0.0005, 0.0003) is None

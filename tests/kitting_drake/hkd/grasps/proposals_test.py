@@ -39,7 +39,7 @@ def test_the_pads_stay_above_a_broad_foot_and_the_table():
     assert propose_grasps(triangles(solid), np.zeros(3))[0].width == pytest.approx(0.018, abs=1e-6)
     deep = PickPlaceParameters(grasp_depth=0.020)
     assert propose_grasps(triangles(solid), np.zeros(3), deep) == []
-    # Nor are there grasps that would touch the table.
+    # Grasps that would touch the table are not proposed either.
     high = PickPlaceParameters(floor_clearance=0.030)
     assert propose_grasps(triangles(bar(160, 18, 12)), np.zeros(3), high) == []
 

@@ -12,7 +12,7 @@ def bar() -> trimesh.Trimesh:
 
 
 def ring() -> trimesh.Trimesh:
-    """Its underside is bounded by two rims, one in the other."""
+    """A ring whose underside lies between two rims, one inside the other."""
     return trimesh.creation.annulus(60, 90, 12).subdivide_to_size(12.0)
 
 

@@ -15,7 +15,7 @@ def union(hulls: list[np.ndarray]) -> Manifold:
 
 
 def bent_handle() -> Manifold:
-    """An arc 20 mm wide and 12 mm high whose middle is at the grasp."""
+    """An arc, 20 mm wide and 12 mm high, with its middle at the origin, where the grasp is."""
     ring = CrossSection.circle(160.0, 400) - CrossSection.circle(140.0, 400)
     arc = ring ^ CrossSection.square((140.0, 100.0), True).translate((0.0, 150.0))
     return arc.translate((-20.0, -150.0)).extrude(12.0)
@@ -56,7 +56,7 @@ def test_the_bottom_is_flat_at_zero():
 
 @pytest.mark.slow
 def test_the_deviation_of_a_complex_outline_is_reported(monkeypatch: pytest.MonkeyPatch):
-    # Try the last tolerances only.
+    # Try only the last entry of the list of tolerances.
     last = convex_decomposition.OUTLINE_TOLERANCES_MM[-1:]
     monkeypatch.setattr(convex_decomposition, "OUTLINE_TOLERANCES_MM", last)
     # A comb with gaps too wide to bridge.

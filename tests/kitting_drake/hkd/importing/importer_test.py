@@ -72,7 +72,7 @@ def test_a_tool_has_the_shape_and_mass_of_its_mesh(plain: importer.ImportReport)
     tool = load_tool(str(plain.directory))
     assert (tool.name, tool.category, tool.split) == ("mallet", "hammer", "user")
     assert (tool.length, tool.width, tool.height) == pytest.approx((0.175, 0.050, 0.016), abs=1e-5)
-    # The head is the working end and made of steel.
+    # The head counts as the working end, which is made of steel.
     head = 1e-9 * 26 * 50 * 16
     handle = 1e-9 * mallet().volume - head
     assert tool.mass == pytest.approx(7850 * head + 1200 * handle, rel=0.05)
@@ -104,7 +104,7 @@ def test_collision_hulls_are_few_convex_and_accurate(plain: importer.ImportRepor
         OpType.Add,
     )
     tool = load_tool(str(plain.directory))
-    # Cavities with a clearance of 2 mm bridge narrow notches.
+    # Compare outlines whose narrow notches are closed, as in cavities with a clearance of 2 mm.
     shadow = closed(together.project().scale((1e3, 1e3)), 2.0)
     outline = closed(tool.footprint.scale((1e3, 1e3)), 2.0)
     deviation = max(furthest(shadow, outline), furthest(outline, shadow))
@@ -154,7 +154,7 @@ def test_unit_pose_and_format_do_not_matter(
         mesh.apply_translation([900, -400, 100])
     mesh.apply_scale(units_per_mm)
     path = exported(mesh, tmp_path / f"mallet.{suffix}")
-    # An unknown unit needs a length, and an ambiguous one a unit.
+    # If the unit is unknown, the length must be given; if it is ambiguous, the unit.
     length = 175.0 if units_per_mm == 37.0 else None
     unit = "inches" if units_per_mm == 1 / 25.4 else None
     report = bring(path, tmp_path / "tools", length_mm=length, unit=unit)
@@ -164,7 +164,7 @@ def test_unit_pose_and_format_do_not_matter(
     mine, other = report.record["grasp"], plain.record["grasp"]
     for key in ("x", "width", "surface_height"):
         assert mine[key] == pytest.approx(other[key], abs=1.5e-3)
-    # The tool may lie on its other side.
+    # The tool may lie on its other side, which changes the sign of y.
     assert abs(mine["y"]) == pytest.approx(abs(other["y"]), abs=5e-4)
 
 
@@ -176,7 +176,7 @@ def test_unit_pose_and_format_do_not_matter(
         (37, 8, 37),
         (0.203, 0.02, 203),
         (0.0155, 0.006, 15.5),
-        # The other unit would be too long, too thin or too high.
+        # In the other possible unit the tool would be too long, too thin or too high.
         (18, 1.2, 180),
         (25, 22, 25),
         (12, 0.35, 304.8),
@@ -434,7 +434,7 @@ def test_names(plain: importer.ImportReport, tmp_path: Path, monkeypatch: pytest
     report = import_tool(ImportRequest(path, "hammer", name="mine"), time_limit=None)
     assert user_tool_names() == ["mine"]
     assert load_tool("mine").directory == report.directory == tmp_path / "own" / "mine"
-    # A tool can be imported again, but other folders are not overwritten.
+    # The same file can be imported again under its name, which replaces the tool.
     again = bring(path, tmp_path / "own", name="mine", length_mm=160.0)
     assert load_tool("mine").length == pytest.approx(0.160) == again.record["length"]
     # Another file of the same name may be a newer version.
@@ -460,7 +460,7 @@ def test_names(plain: importer.ImportReport, tmp_path: Path, monkeypatch: pytest
 def test_two_runs_into_one_folder(
     plain: importer.ImportReport, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """What another run made meanwhile is not overwritten, unless it is of the same file."""
+    """A tool that another run made meanwhile is overwritten only if it comes from the same file."""
     make = quickly_made(plain)
     first = exported(mallet(), tmp_path / "first.stl")
     second = exported(mallet(), tmp_path / "second.stl")
@@ -490,7 +490,7 @@ def test_numbers_out_of_range(options: dict, tmp_path: Path):
 def test_the_child_process_has_a_limit_of_time(tmp_path: Path):
     path = exported(mallet(), tmp_path / "mallet.stl")
     with pytest.raises(UserError, match="s of processor time and was stopped while"):
-        # The start alone takes longer than the least limit, 1 s.
+        # Starting the process takes longer than 1 s, the least limit that is allowed.
         import_tool(ImportRequest(path, "hammer", output=tmp_path / "tools"), time_limit=-9.0)
     assert not (tmp_path / "tools").exists()
 
@@ -615,6 +615,6 @@ def test_an_unbalanced_tool_is_laid_in_its_resting_pose(tmp_path: Path):
     tilt = resting_tilt(report.directory / "d.sdf")
     assert np.degrees(np.arccos(tilt[2, 2])) < 2
     tool = load_tool(str(report.directory))
-    # The shaft's end is on the table.
+    # The lowest point of the shaft's end is on the table.
     low = tool.triangles.reshape(-1, 3)
     assert low[low[:, 0] > 0.9 * low[:, 0].max()][:, 2].min() < 0.001

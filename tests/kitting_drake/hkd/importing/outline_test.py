@@ -13,7 +13,7 @@ BAR = '<rect x="5" y="10" width="160" height="20"/>'
 
 
 def drawing(folder: Path, content: str, size: str = 'width="200mm" height="80mm"') -> Path:
-    """An SVG whose viewBox is 200 by 80."""
+    """Writes an SVG with this content and a viewBox of 200 by 80; returns its path."""
     path = folder / "tool.svg"
     path.write_text(
         f'<svg xmlns="http://www.w3.org/2000/svg" {size} viewBox="0 0 200 80">{content}</svg>'
@@ -22,7 +22,10 @@ def drawing(folder: Path, content: str, size: str = 'width="200mm" height="80mm"
 
 
 def stadium(folder: Path, units: int, scale: float) -> Path:
-    """A slot of 160 by 20 mm with a hole of 8 mm, of lines and arcs in mixed order."""
+    """Writes a DXF of a slot of 160 by 20 mm with a hole of 8 mm; returns its path.
+
+    The slot's lines and arcs are not in the order of the contour.
+    """
     document = ezdxf.new(units=units)
     space = document.modelspace()
     space.add_line((0, 0), (140 * scale, 0))
@@ -83,7 +86,7 @@ def test_a_symbol_counts_where_it_is_used(tmp_path: Path):
 
 
 def test_y_points_up_and_transforms_count(tmp_path: Path):
-    # A triangle whose right angle is at the lower left.
+    # As drawn, the triangle has its right angle at the lower left.
     path = drawing(tmp_path, '<path transform="rotate(0) translate(10)" d="M0 70 h150 L0 20 z"/>')
     assert read_drawing(path).outline.bounds() == pytest.approx((10, -70, 160, -20), abs=1e-3)
 
@@ -167,7 +170,7 @@ def bring(path: Path, **options: float) -> ImportReport:
 def test_an_outline_becomes_a_tool_of_its_size(tmp_path: Path):
     path = drawing(tmp_path, '<rect width="110" height="14"/><circle cx="8" cy="7" r="3"/>')
     tool = load_tool(str(bring(path, height_mm=12.0).directory))
-    # A mesh of 110 mm would be scaled, but an outline has true measures.
+    # An imported mesh of 110 mm is scaled to its category's length; an outline keeps its size.
     assert (tool.length, tool.width, tool.height) == pytest.approx((0.110, 0.014, 0.012), abs=2e-5)
     assert tool.footprint.area() == pytest.approx(1e-6 * (110 * 14 - 9 * np.pi), rel=1e-2)
 
@@ -186,7 +189,7 @@ def test_an_outline_must_be_stable_as_drawn(tmp_path: Path):
 
 
 def test_the_length_does_not_depend_on_the_drawings_rotation(tmp_path: Path):
-    # Its bounding box is 123 mm wide.
+    # The rotated rectangle's bounding box is 123 mm wide.
     path = drawing(tmp_path, '<rect transform="rotate(45)" width="160" height="14"/>')
     x_min, y_min, x_max, y_max = laid_along_x(read_drawing(path).outline, None, "tool.svg").bounds()
     assert (x_max - x_min, y_max - y_min) == pytest.approx((160, 14), abs=0.05)
@@ -198,7 +201,7 @@ def test_the_length_does_not_depend_on_the_drawings_rotation(tmp_path: Path):
 
 
 def test_a_scaled_drawing_still_asks_whether_its_rectangle_is_a_frame(tmp_path: Path):
-    # In units of the viewBox, the rectangle is longer than any tool.
+    # The frame is 950 units long, but 190 mm: it could be a tool.
     path = tmp_path / "tool.svg"
     path.write_text(
         '<svg xmlns="http://www.w3.org/2000/svg" width="200mm" viewBox="0 0 1000 400">'

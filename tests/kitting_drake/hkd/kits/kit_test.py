@@ -88,7 +88,7 @@ def test_the_clearance_is_kept_all_around(tools: list[Tool], cavities: list[Cavi
     for tool, cavity in zip(tools, cavities, strict=True):
         outline = seated_outline(tool)
         assert (grown(outline, 0.0019) - cavity.outline).area() < 1e-9, tool.name
-        # The closing does not affect the tool's extremes, so the clearance is exact there.
+        # Closing narrow notches does not affect the extremes, so the clearance is exact there.
         box, tool_box = np.array(cavity.outline.bounds()), np.array(outline.bounds())
         np.testing.assert_allclose(np.abs(box - tool_box), 0.002, atol=1.5e-4)
         # At least half of the wall follows the tool at the clearance.
@@ -112,7 +112,7 @@ def test_clearance_is_a_parameter(tools: list[Tool]):
 
 
 def contact_surface(cavities: list[Cavity], parameters: KitParameters) -> tuple[NDArray, NDArray]:
-    """The vertices and faces of all parts together."""
+    """The vertices and faces of the contact surface, whose parts are joined."""
     meshes = [
         trimesh.Trimesh(*part, process=False)
         for part in contact_surfaces(cavities, parameters).values()
@@ -137,7 +137,7 @@ def test_the_contact_surface_has_the_walls_of_the_block(tools: list[Tool], lead_
         area, centre = mesh_.area_faces[chosen], mesh_.triangles_center[chosen]
         return area.sum(), area @ centre, (area * mesh_.face_normals[chosen].T) @ centre
 
-    for low, high in ((-0.1, 0.1), (0.1, 0.9)):  # Walls; bevels.
+    for low, high in ((-0.1, 0.1), (0.1, 0.9)):  # First walls, then bevels.
         for one, other in zip(facing(block, low, high), facing(contact, low, high), strict=True):
             np.testing.assert_allclose(one, other, atol=2e-7)
     # The floors are at the block's heights and face up.
@@ -183,7 +183,7 @@ def test_no_part_of_the_contact_surface_is_inside_a_cavity(names: list[str], lea
             return [(triangle ^ inner).area() for triangle in triangles]
 
         assert max(inside(heights > cavity.floor + 1e-6)) < 1e-12
-        # The floor is complete and occurs once.
+        # The triangles at the floor's height cover the cavity exactly once.
         floor = inside(np.abs(heights - cavity.floor) < 1e-9)
         assert sum(floor) == pytest.approx(inner.area(), rel=1e-6)
 
@@ -199,7 +199,7 @@ def test_a_kit_is_built_once(tools: list[Tool], cache: Path, monkeypatch: pytest
     with monkeypatch.context() as patch:
         patch.setattr(kit_module, "_write", fail)
         assert make_kit(tools, PARAMETERS).sdf == first.sdf
-    # A crash can leave empty files.
+    # An empty file, as a crash can leave it, is written again.
     path = first.sdf.with_name("contact_sides.obj")
     content = path.read_bytes()
     path.write_bytes(b"")
@@ -237,7 +237,7 @@ def test_concurrent_builds_of_the_same_kit_both_succeed(
 
     def write_together(*arguments: object) -> None:
         write(*arguments)  # type: ignore[arg-type]
-        both.wait(timeout=60)  # Neither kit is in place yet.
+        both.wait(timeout=60)  # Both are written, but neither is in its final folder yet.
 
     monkeypatch.setattr(kit_module, "_write", write_together)
     with ThreadPoolExecutor(2) as pool:

@@ -1,4 +1,4 @@
-"""A tool finds its place in a cavity made for another outline of it."""
+"""A tool's pose is found in a cavity that was made for its model."""
 
 import math
 
@@ -31,5 +31,5 @@ def test_a_bite_in_the_model_leaves_no_room():
     model = wrench() - bite
     seat = find_seat(wrench(), model, cavity_outline(model, EASY))
     assert seat.room < 0
-    # Half of the bite's depth is gained by moving away from it.
+    # Moving away from the bite shares its overlap of 0.3 mm between both sides.
     assert seat.room == pytest.approx((0.7e-3 - 1e-3) / 2, abs=1e-4)

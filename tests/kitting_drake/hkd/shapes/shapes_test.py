@@ -65,7 +65,7 @@ def test_the_declared_symmetry_is_the_shapes(shape: OutlinedShape):
 
 @each_shape
 def test_a_turned_shape_does_not_fit_its_cavity(shape: OutlinedShape):
-    """A cavity that bridged too much would take a shape at any heading."""
+    """If the cavity bridged too many notches of the outline, the shape would fit at any heading."""
     outline = about_its_axis(shape).scale((1e-3, 1e-3))
     cavity = cavity_outline(outline, AssemblingKits().kit)
     assert (outline - cavity).area() < 1e-9
@@ -88,7 +88,7 @@ def test_the_hulls_of_a_ring_leave_its_hole_open():
 
 
 def test_a_mesh_is_scaled_as_in_ravens(tmp_path: Path):
-    """A triangle with a side of 20 units, so 60 mm. Its grasp holds a corner against a side."""
+    """A triangle whose sides are 20 units becomes one of 60 mm, held by a corner and a side."""
     triangle = CrossSection(
         [20 / 3**0.5 * np.array([(1, 0), (-0.5, 0.75**0.5), (-0.5, -(0.75**0.5))])]
     )
@@ -98,7 +98,7 @@ def test_a_mesh_is_scaled_as_in_ravens(tmp_path: Path):
     assert sorted((tool.length, tool.width)) == pytest.approx([0.030 * 3**0.5, 0.060], abs=1e-5)
     assert tool.height == pytest.approx(0.020)
     assert tool.grasp.width == pytest.approx(0.030 * 3**0.5, abs=5e-4)
-    # The axis is at a third of the height, not in the middle of the bounding box.
+    # The axis is at a third of the triangle's height, not in the middle of its bounding box.
     assert tool.axis == pytest.approx((-0.030 * 3**0.5 / 6, 0.0), abs=1e-5)
     assert imported_shape(path).directory == tool.directory
     record = yaml.safe_load((tool.directory / "tool.yaml").read_text())

@@ -64,7 +64,7 @@ def test_a_fresh_tool_is_unlike_all_others_of_its_category(name: str):
         if other.category == tool.category
     }
     nearest = min(distances, key=distances.__getitem__)
-    # With fewer points than below, distances are a little larger.
+    # Fewer points than in the next test give larger distances, so the limit is larger.
     assert distances[nearest] > 0.0016, nearest
 
 

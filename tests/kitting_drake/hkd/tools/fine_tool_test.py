@@ -1,4 +1,4 @@
-"""Collision geometry for tight cavities: how close it is, and that only what fits goes in."""
+"""Collision geometry for tight cavities is accurate, and a tool goes in only if it fits."""
 
 import dataclasses
 import xml.etree.ElementTree as ElementTree

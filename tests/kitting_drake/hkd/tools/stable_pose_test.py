@@ -18,7 +18,7 @@ def test_a_box_rests_on_each_of_its_sides():
 
 def test_a_box_with_an_off_centre_mass_has_fewer_poses():
     box = trimesh.creation.box((180, 20, 10))
-    # The centre of mass is beyond the support of four sides, and inside that of two.
+    # On four of the six sides the box would tip over; on the other two it rests.
     poses = stable_poses(np.asarray(box.vertices), np.array([0.0, 9.0, 6.0]))
     assert {tuple(np.round(pose.normal).astype(int)) for pose in poses} == {(0, 0, 1), (0, 0, -1)}
     assert all(pose.margin == pytest.approx(1) for pose in poses)

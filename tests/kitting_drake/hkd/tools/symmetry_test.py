@@ -29,7 +29,7 @@ def triangles(solid: Manifold) -> NDArray[np.float64]:
 @pytest.mark.parametrize(
     ("solid", "order"),
     [
-        # The best centre is not at the origin.
+        # The symmetry's centre is not at the origin.
         (bar().translate((3, -1, 0)), 2),
         # Point-symmetric but not mirror-symmetric.
         (
@@ -44,7 +44,7 @@ def triangles(solid: Manifold) -> NDArray[np.float64]:
             + block(20, 30, 10).translate((-80, 5, 0)),
             1,
         ),
-        # A notch of half a millimetre is below the limits; one of 5 mm is not.
+        # A notch of half a millimetre does not break the symmetry; one of 5 mm does.
         (bar() - block(1, 4, 30).translate((90, 0, 0)), 2),
         (bar() - block(10, 4, 30).translate((90, 0, 0)), 1),
         pytest.param(prism(6, 60), 6, marks=pytest.mark.slow),
@@ -64,7 +64,7 @@ def test_symmetry_order(solid: Manifold, order: int, monkeypatch: pytest.MonkeyP
 def test_measure_rotation():
     longer = bar() + block(10, 20, 10).translate((85, 5, 0))
     reversal = measure_rotation(triangles(longer), complete=True)
-    # The step of 5 mm is shared between both ends.
+    # One end has a step of 5 mm; the best rotation spreads the deviation over both ends.
     assert reversal.outline_deviation_mm == pytest.approx(2.5, abs=0.1)
     assert 0.1 < reversal.surface_distance_mm < 0.5
     assert not reversal.is_symmetric

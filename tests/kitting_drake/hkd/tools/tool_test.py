@@ -45,7 +45,7 @@ def test_record_and_meshes_of_the_projects_tools_agree(name: str):
 def test_a_tool_loads_by_path(copy: Path, tmp_path: Path):
     shipped = load_tool("flat_screwdriver")
     assert shipped.directory == MODELS / "tools" / "flat_screwdriver"
-    # The model's file is named after the record's name, not the folder.
+    # The model's file has the name in the tool's record, which is not that of the copied folder.
     for tool in (load_tool(str(copy)), load_tool("mine", tmp_path), load_tool("./mine", tmp_path)):
         assert tool.directory == copy
         assert tool.sdf.is_file()
@@ -121,7 +121,7 @@ def test_add_s_does_not_depend_on_the_tessellation(tmp_path: Path):
     fine = []
     for path in tool.visual_meshes:
         mesh = trimesh.load_mesh(path, process=False)
-        # Refine only one end, which would bias a score by vertices.
+        # Refine the mesh at one end only: a score that counted vertices would change.
         end = np.flatnonzero(mesh.triangles_center[:, 0] > 0.02)
         if len(end):
             mesh = mesh.subdivide(end).subdivide()

@@ -22,7 +22,7 @@ def test_the_splits_have_the_expected_numbers_of_tools():
 
 @pytest.mark.parametrize("split", SPLITS)
 def test_toolsets_are_distinct_and_of_one_split(split: str):
-    """There are a hundred, or all combinations if there are fewer."""
+    """A split has a hundred toolsets, or all combinations if there are fewer."""
     drawn = toolsets(split)
     combinations = math.prod(len(pool) for pool in tool_pools(split).values())
     assert len(set(drawn)) == len(drawn) == min(TOOLSET_COUNT, combinations)
@@ -30,7 +30,7 @@ def test_toolsets_are_distinct_and_of_one_split(split: str):
         tools = [load_tool(name) for name in names]
         assert tuple(tool.category for tool in tools) == CATEGORIES
         assert {tool.split for tool in tools} == {split}
-    # Every tool occurs.
+    # Every tool of the split occurs in some toolset.
     assert {name for names in drawn for name in names} == {
         name for pool in tool_pools(split).values() for name in pool
     }
@@ -44,7 +44,7 @@ def test_toolsets_are_distinct_and_of_one_split(split: str):
     ],
 )
 def test_the_papers_toolsets_do_not_change(split: str, digest: str):
-    """Demonstrations, weights and results depend on them."""
+    """Published demonstrations, weights and results depend on these toolsets."""
     assert hashlib.sha256(json.dumps(toolsets(split)).encode()).hexdigest() == digest
 
 

@@ -30,7 +30,7 @@ SPANNER = (
     - CrossSection.circle(9, 60)
     - CrossSection.square((22, 12)).translate((110, -6))
 )
-"""A spanner with a ring of 18 mm and a jaw of 12 mm."""
+"""The outline of a spanner with a ring whose hole is 18 mm and a jaw that is 12 mm wide."""
 
 
 def photo_of(folder: Path, *tools: PlacedTool, printed: PlacedPrint | None = None, **spec) -> Path:
@@ -156,7 +156,7 @@ def test_photos_of_other_kinds_are_read_as_seen(tmp_path: Path):
 def test_points_correct_the_outline(tmp_path: Path):
     path = photo_of(tmp_path, spanner())
     points = tmp_path / "points.yaml"
-    # The rulers are the sheet's: close the ring and cut off the jaw.
+    # In the sheet's coordinates (mm): close the ring and cut off the jaw.
     points.write_text(
         "- add: [[75, 85], [105, 85], [105, 115], [75, 115]]\n"
         "- remove: [[190, 50], [250, 50], [250, 150], [190, 150]]\n"
@@ -171,10 +171,10 @@ def test_points_correct_the_outline(tmp_path: Path):
 
 @pytest.mark.slow
 def test_an_outline_that_may_be_wrong_is_in_doubt_until_its_user_settles_it(tmp_path: Path):
-    # Steel as light as the shadow beside it.
+    # The steel is as bright as the shadow beside it.
     pale = PlacedTool(SPANNER.translate((90, 100)), 14, ("steel", "steel"))
     path = photo_of(tmp_path, pale, shadow=0.5, light=(0.9, -0.9), softness=0.2, seed=2)
-    # A correction elsewhere settles nothing.
+    # A correction in another part of the photo settles no doubt.
     points = tmp_path / "points.yaml"
     points.write_text("- remove: [[0, 0], [297, 0], [297, 60], [0, 60]]\n")
     (tool,) = traced(path, points=points).tools
@@ -214,7 +214,7 @@ def test_two_points_or_a_coin_give_the_scale_without_a_sheet(by: str, tmp_path: 
         (tool,) = traced(path, heights_mm=(12.0,), scale=Scale(disc_mm=25.75)).tools
         assert np.median(outline_errors(tool.outline, SPANNER)) < 0.4
         return
-    # By the camera: 26 mm on the diagonal of 43.27 mm, 400 mm away.
+    # The photo's scale: a 26 mm lens on full frame (diagonal 43.27 mm), 400 mm away.
     px_per_mm = 26 / math.hypot(36, 24) * math.hypot(*SMALL) / 400
     scale = Scale(points=(100.0, 100.0, 100.0 + 50 * px_per_mm, 100.0), length_mm=50.0)
     tools = traced(path, heights_mm=(12.0, 2.0), scale=scale).tools
@@ -233,7 +233,7 @@ def test_a_camera_height_overrules_the_focal_length(tmp_path: Path):
 
 
 def test_a_coin_or_a_board_gives_the_scale(tmp_path: Path):
-    """In photos from straight above, of 5 pixels for each mm."""
+    """Both photos are taken from straight above, at 5 pixels per millimetre."""
     pixels = np.full((900, 1200, 3), 60, np.uint8)
     cv2.circle(pixels, (300, 400), 100, (180, 40, 40), -1, cv2.LINE_AA)
     photo = Photo(tmp_path / "photo.jpg", pixels, 26.0)

@@ -98,7 +98,7 @@ def test_a_written_file_reads_back(tmp_path: Path):
 def test_images_stay_available_when_their_file_is_replaced(tmp_path: Path):
     path = written(tmp_path)
     read = read_demonstrations(path).demonstrations
-    # Replacing or deleting the file makes no difference.
+    # Replacing or deleting the file does not change the images that were read from it.
     write_demonstrations(path, ORIGIN, [demonstration(99)])
     path.unlink()
     for found, expected in zip(read, [demonstration(10), demonstration(12)], strict=True):

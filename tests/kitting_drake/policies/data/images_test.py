@@ -20,7 +20,7 @@ MIDDLE = np.array([(ROWS - 1) / 2, (COLS - 1) / 2])
 
 
 def marked(pick: tuple[float, float], place: tuple[float, float]) -> LabelledImage:
-    """An image with a round hill at each label, 1 m and 2 m high."""
+    """An image with round hills at its labels: 1 m high at the pick, 2 m high at the place."""
     row, col = np.meshgrid(np.arange(ROWS), np.arange(COLS), indexing="ij")
     height = sum(
         top * np.exp(-((row - at[0]) ** 2 + (col - at[1]) ** 2) / 8)
@@ -34,7 +34,7 @@ SAMPLE = marked((20.0, 30.0), (38.25, 55.5))
 
 
 def hill(sample: LabelledImage, near: np.ndarray) -> np.ndarray:
-    """The centre of the hill near a position."""
+    """The centre (row, col) of the hill near a position."""
     row, col = np.rint(near).astype(int)
     rows, cols = np.arange(row - 6, row + 7), np.arange(col - 6, col + 7)
     weights = sample.image[3][np.ix_(rows, cols)]
@@ -46,7 +46,8 @@ def test_rotations_are_counter_clockwise_with_row_0_on_top():
     down, right = np.array([1.0, 0]), np.array([0, 1.0])
     np.testing.assert_allclose(rotation_matrix(math.pi / 2) @ down, right, atol=1e-12)
     image = np.zeros((3, 3))
-    image[2, 1] = 1  # Below the centre; a counter-clockwise rotation moves it to the right.
+    # A counter-clockwise rotation moves this pixel from below the centre to the right of it.
+    image[2, 1] = 1
     assert np.rot90(image)[1, 2] == 1
 
 
@@ -62,7 +63,7 @@ def test_labels_of_an_action():
 
 
 def test_other_points_of_the_object_move_rigidly_with_it():
-    # A rotation by 90 degrees moves a point below the pick to the right of the place.
+    # The object turns by 90 degrees: a point below the pick goes to the right of the place.
     sample = LabelledImage(
         SAMPLE.image, np.array([10.0, 20]), 0.0, np.array([40.0, 50]), math.pi / 2
     )
@@ -163,7 +164,10 @@ def barred(theta: float) -> LabelledImage:
 
 
 def middle_line(image: np.ndarray, theta: float, u: float) -> float:
-    """The offset of the bar's centre line, `u` pixels along its direction from the centre."""
+    """The sideways offset, in pixels, of a bar's centre line from a line in direction `theta`.
+
+    The line passes through the image's centre; the offset is measured `u` pixels along it.
+    """
     across = np.linspace(-12, 12, 97)
     points = (
         np.array(image.shape[1:]) // 2
@@ -180,7 +184,7 @@ def middle_line(image: np.ndarray, theta: float, u: float) -> float:
 def test_curvature_keeps_position_and_direction_at_the_pick(theta: float, moved: bool, index: int):
     sample = barred(theta)
     if index:
-        # The bar is one of the other objects.
+        # The bar is not the picked object, but one of the others.
         sample = dataclasses.replace(
             sample,
             pick=np.array([10.0, 80.0]),
@@ -198,7 +202,7 @@ def test_curvature_keeps_position_and_direction_at_the_pick(theta: float, moved:
     start = middle_line(curved, theta, 0)
     for u in (-16, -8, -3, 3, 8, 16):
         v = u / 20
-        # The object moves opposite to the displacement of the sampled pixels.
+        # The crop samples displaced pixels, so the object seems displaced the other way.
         expected = -20 * (0.3 * v**2 - 0.1 * v**3)
         assert middle_line(curved, theta, u) - start == pytest.approx(expected, abs=1.2)
 
@@ -230,11 +234,11 @@ def test_reflection_mirrors_the_image_and_its_labels(theta: float):
         np.testing.assert_allclose(hill(mirrored, at), at, atol=0.02)
     assert (mirrored.pick_theta, mirrored.rotation) == (-0.3, -1.1)
     np.testing.assert_array_equal(mirrored.other_picks, [[20.0, COLS - 1 - 60]])
-    # The grasp of a bar stays along the bar.
+    # A bar's grasp angle is mirrored with the bar.
     bar = reflect(barred(theta))
     middles = [middle_line(bar.image, bar.pick_theta, u) for u in (-12, 0, 12)]
     np.testing.assert_allclose(middles, 0.0, atol=0.5)
-    # The mirrored object rotates in the opposite direction.
+    # A mirrored scene's object rotates in the opposite direction.
     beside = sample.pick + (3.0, -2.0)
     across = np.array([0, COLS - 1]) + beside * (1, -1)
     expected = np.array([0, COLS - 1]) + sample.place_of(beside) * (1, -1)

@@ -70,7 +70,7 @@ def sources(tmp_path: Path) -> list[Path]:
 
 
 def expected() -> dict[str, NDArray[Any]]:
-    """The frames, computed independently of the tested code."""
+    """The frames that the dataset must hold, computed independently of the tested code."""
     episodes = [frames(seed, count) for seed, count in enumerate(LENGTHS)]
     return {
         "image": np.concatenate([pictures(seed, count) for seed, count in enumerate(LENGTHS)]),
@@ -263,5 +263,5 @@ def test_lerobot_reads_what_was_written(sources: list[Path], tmp_path: Path, par
     assert set(result["differences"].values()) == {0}, result
     assert result["statistics_difference"] < 1e-6
     assert result["second_episode"] == [4, 5]
-    # Chunks of actions, as ACT and diffusion policies read them.
+    # ACT and diffusion policies read the next actions as chunks; none of their values differs.
     assert result["next_actions"] == 0

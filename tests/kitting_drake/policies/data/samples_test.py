@@ -22,7 +22,7 @@ ROTATION = 1.25
 
 
 def demonstration(seed: int, steps: int) -> Demonstration:
-    """Step i moves the object at pixel (i, 2 i) to (10 + i, 3)."""
+    """A demonstration whose step i moves the object at pixel (i, 2 i) to pixel (10 + i, 3)."""
     taken = []
     for i in range(steps):
         pick, place = GRID.to_world((i, 2 * i)), GRID.to_world((10 + i, 3))
@@ -50,7 +50,7 @@ def test_later_picks_are_labels_of_earlier_observations(observed: list[ObservedS
             np.testing.assert_allclose(target.place, (10 + i, 3), atol=1e-9)
             assert target.pick_theta == THETAS[i]
             assert target.rotation == pytest.approx(ROTATION)
-    # Each observation has its own image.
+    # Each of the four scenes has the image of its own observation.
     heights = [scene.recorded.height[0, 0] for scene in observed]
     assert heights == pytest.approx([0.10, 0.11, 0.12, 0.20])
 
@@ -107,7 +107,7 @@ def test_constant_inputs_do_not_divide_by_zero():
 
 
 def with_a_hole() -> np.ndarray:
-    """A coloured 20 mm plate on a coloured table, with an unseen pixel in the plate."""
+    """An image of a 20 mm high plate on a table, all in grey; one pixel of the plate is unseen."""
     image = np.full((4, *GRID.shape), 0.5, np.float32)
     image[3] = 0.0
     image[3, 5:12, 5:12] = 0.02
@@ -131,7 +131,7 @@ def test_networks_without_colours_learn_from_the_inputs_of_inference():
 
 
 def test_a_black_image_has_no_unseen_pixels():
-    """Otherwise the table, at height zero, would be filled in from its neighbours."""
+    """Black pixels at height zero are the table, which must not be filled in as if unseen."""
     assert not samples.observed(with_a_hole(), GRID).valid[8, 8]
     black = with_a_hole()
     black[:3] = 0.0

@@ -35,7 +35,7 @@ def twice_backwards(space: BaseLayout) -> None:
 
 
 def in_pieces(space: BaseLayout) -> None:
-    """The second time in pieces, and a hundredth of a millimetre off."""
+    """The slot, and parts of it again: in pieces, some of them 0.01 mm off."""
     slot(space)
     space.add_line((0, 0.01), (70, 0.01))
     space.add_line((70, 0.01), (140, 0.01))
@@ -64,7 +64,7 @@ def with_unplotted_layers(space: BaseLayout) -> None:
 
 
 def in_short_pieces(space: BaseLayout) -> None:
-    """Lines shorter than the gaps that are joined."""
+    """The arcs consist of lines that are shorter than the gaps that the reader closes."""
     turn = np.linspace(-np.pi / 2, np.pi / 2, 400)
     for start, x in ((0, 140), (np.pi, 0)):
         arc = np.c_[x + 10 * np.cos(turn + start), 10 + 10 * np.sin(turn + start)]
@@ -76,7 +76,7 @@ def in_short_pieces(space: BaseLayout) -> None:
 
 
 def overshooting(space: BaseLayout) -> None:
-    """Lines that cross where they should end."""
+    """The ends of lines and arcs cross each other, or stop short."""
     space.add_line((0.03, 0), (140, 0))
     space.add_arc((140, 10), 10, -89.9, 90.1)
     space.add_line((140, 20), (0, 20.03))
@@ -152,7 +152,7 @@ def test_a_drawing_without_a_unit_is_in_mm_or_as_asked(header: str, tmp_path: Pa
 
 def test_a_missing_end_is_not_a_missing_part(tmp_path: Path):
     whole = box(tmp_path / "tool.dxf", 1.0, 1).read_text()
-    # Without the end mark, and with the end-of-file byte of DOS behind it.
+    # One file lacks the end mark; the other has DOS's end-of-file byte after it.
     for text in ("999\nby a program\n" + whole.removesuffix("0\nEOF\n"), whole + "\x1a"):
         (tmp_path / "tool.dxf").write_text(text)
         assert read_drawing(tmp_path / "tool.dxf").outline.area() == pytest.approx(3200, rel=1e-3)

@@ -49,7 +49,7 @@ MM = 'width="200mm" height="60mm" viewBox="0 0 200 60"'
         (svg(bar(25.4 / 72), 'width="595" height="842"'), "A4 in units of 1/72 inch"),
         (svg(bar(25.4 / 90), 'width="744.09" height="1052.36" viewBox="0 0 744.09 1052.36"'), "A4"),
         (svg(bar(25.4), 'width="8in" height="2.4in" viewBox="0 0 8 2.4"'), "width and height"),
-        # The viewBox is rounded up to whole units of 1/72 inch.
+        # The program rounded the viewBox up to whole units of 1/72 inch.
         (svg(bar(25.4 / 72), 'width="200mm" height="60mm" viewBox="0 0 567 171"'), "width and"),
         (svg(bar(), 'style="width:200mm;height:60mm" viewBox="0 0 200 60"'), "width and height"),
     ],
@@ -77,7 +77,7 @@ def test_a_drawing_without_a_size_is_refused(root: str, tmp_path: Path):
 @pytest.mark.parametrize(
     ("root", "before", "sizes"),
     [
-        # A page of Inkscape 0.91, kept by a newer one; and a page of Inkscape, kept by Illustrator.
+        # A newer Inkscape saved a page of version 0.91; Illustrator saved a page of Inkscape.
         (f'{INKSCAPE}"1.2" width="744.09" height="1052.36"', "", "278 mm or 297 mm"),
         ('width="793.7" height="1122.52"', ILLUSTRATOR, "396 mm or 297 mm"),
     ],
@@ -138,7 +138,7 @@ def test_filled_paths_are_closed_and_thick_lines_are_not_holes(tmp_path: Path):
     drawing = read_drawing(path)
     assert drawing.outline.area() == pytest.approx(160 * 20, rel=1e-4)
     assert "20.00 mm" in drawing.notes[0]
-    # The stroke of the outline, expanded to an area.
+    # The outline's stroke was converted to a filled path.
     path.write_text(svg('<path d="M20 10H180V30H20z M21 11V29H179V11z"/>', MM))
     drawing = read_drawing(path)
     assert drawing.outline.area() == pytest.approx(160 * 20, rel=1e-4)
@@ -168,7 +168,7 @@ SOLID = '<path fill="#333" d="M20 20h160v20h-160z"/>'
 @pytest.mark.parametrize(
     "content",
     [
-        # A frame around a tool without holes: square, with round corners, or as large as the page.
+        # A tool without holes in a frame: sharp, rounded, as large as the page, or in the same path.
         f'<rect x="5" y="5" width="190" height="50" {LINE}/>' + SOLID,
         f'<rect x="5" y="5" width="190" height="50" rx="8" {LINE}/>' + SOLID,
         f'<rect width="200" height="60" {LINE}/><path {LINE} d="M20 20h160v20h-160z"/>',
@@ -189,7 +189,7 @@ def test_a_frame_that_may_be_the_tool_is_a_question(content: str, tmp_path: Path
 @pytest.mark.parametrize(
     "plate",
     [
-        # One filled element, a round hole, and a small one.
+        # The hole is part of a filled path, is round, or is small.
         '<path fill-rule="evenodd" d="M20 10h120v40h-120z M40 20h80v20h-80z"/>',
         f'<rect x="20" y="10" width="120" height="40" {LINE}/><circle cx="80" cy="30" r="16"/>',
         '<rect x="20" y="10" width="120" height="40"/><rect x="60" y="25" width="20" height="6"/>',

@@ -91,7 +91,7 @@ def test_an_object_in_another_file(tmp_path: Path):
 
 
 def test_a_written_block_is_read_and_has_a_unit(tmp_path: Path):
-    # 20 mm might also be 200 mm, but a 3MF says what it is.
+    # Without a unit, 20 could be mm or cm, but a 3MF file states its unit.
     box = trimesh.creation.box((20, 6, 4.5))
     path = tmp_path / "bit.3mf"
     path.write_bytes(threemf_bytes((box.vertices, box.faces), "bit"))
