@@ -1,4 +1,4 @@
-"""Touching objects are told apart, heaps are taken apart, and nothing is tried in vain."""
+"""Touching objects are told apart, heaps are taken apart, and vain attempts are not repeated."""
 
 import dataclasses
 
@@ -17,7 +17,7 @@ PLANNER = PickPlaceParameters()
 
 
 def hammer(rows: int, cols: int) -> NDArray[np.bool_]:
-    """A T of 50 by 24 pixels with its corner at (rows, cols)."""
+    """The mask of a hammer: a T of 50 by 24 pixels whose bounding box starts at (rows, cols)."""
     mask = np.zeros(GRID.shape, bool)
     mask[rows + 8 : rows + 15, cols : cols + 50] = True
     mask[rows : rows + 24, cols + 42 : cols + 50] = True
@@ -44,7 +44,7 @@ def scene(*objects: tuple[NDArray[np.bool_], float], filled: bool = False) -> Ob
 
 
 def placed_at(pixel: tuple[float, float], *, aside: bool = True, pick: bool = False) -> Attempt:
-    """An earlier action that laid an object at a pixel, or picked it there."""
+    """An earlier action that laid an object at a pixel, or (`pick`) picked one up there."""
     x, y = GRID.to_world(pixel)
     here, away = PlanarPose(float(x), float(y)), PlanarPose(0.3, -0.45)
     poses = (here, away) if pick else (away, here)
@@ -70,7 +70,7 @@ def test_a_box_that_contains_the_outline_of_a_recess_is_not_split():
 
 
 def crossed() -> Observation:
-    """A bar under a longer and wider one, which fits nowhere."""
+    """A scene with a bar that lies under a longer and wider bar, which fits no recess."""
     upright = np.zeros(GRID.shape, bool)
     upright[36:92, 215:226] = True
     return scene((bar(60, 200), 0.015), (upright, 0.030))
@@ -84,7 +84,7 @@ def test_a_heap_is_taken_apart_from_the_top():
     assert observation.height[row, col] == pytest.approx(0.030)
     row, col = np.rint(GRID.to_pixel((action.place.x, action.place.y))).astype(int)
     assert observation.height[row - 3 : row + 4, col - 3 : col + 4].max() == 0
-    # Only `recover` spends actions on it.
+    # The upper bar is taken away only with `recover`.
     assert ShapeMatchingPolicy(PLANNER)(observation).reason == "nothing fits"
     assert ShapeMatchingPolicy(PLANNER, recover=True)(observation) == action
 
@@ -113,7 +113,7 @@ def test_a_full_kit_is_no_missing_kit():
 
 
 def test_a_recess_that_was_filled_is_not_left_over():
-    # Nothing is loose, and what lies in the recesses is as flat as their floors.
+    # No object is visible: a seated one could be as flat as its recess's floor.
     empty = scene()
     assert len(Inventory.of(empty).left_over.cavities) == 2
     placed = dataclasses.replace(empty, history=(placed_at((42.0, 60.0), aside=False),))
@@ -121,11 +121,11 @@ def test_a_recess_that_was_filled_is_not_left_over():
 
 
 def test_the_visible_parts_of_a_filled_recess_are_not_free():
-    """A box beside a full kit is as large as what is left of the hammer's recess, and stays."""
+    """A box beside a full kit is as large as the visible part of a recess, but must stay."""
     box = np.zeros(GRID.shape, bool)
     box[60:70, 180:205] = True
     observation = scene((box, 0.015), filled=True)
-    # The hammer's head is deeper than the least depth of a recess, and its shaft is not.
+    # The seated hammer's head is low enough in the block to count as a recess, its shaft is not.
     seated = observation.height.copy()
     seated[hammer(30, 35)] = 0.048
     seated[30:54, 77:85] = 0.0465
@@ -150,7 +150,7 @@ def test_two_kits_are_seen():
 
 
 def angle(rows: int, cols: int, *, mirrored: bool = False) -> NDArray[np.bool_]:
-    """An L of 50 by 24 pixels, which is not its own mirror image."""
+    """The mask of an L of 50 by 24 pixels, which is not its own mirror image."""
     mask = np.zeros(GRID.shape, bool)
     mask[rows : rows + 8, cols : cols + 50] = True
     arm = slice(rows, rows + 24) if not mirrored else slice(rows - 16, rows + 8)
@@ -175,7 +175,7 @@ def test_an_object_on_its_wrong_face_is_turned_over_the_block_s_edge():
     assert len(found.reversed_items) == 1 and not found.pairs
     action = turning_action(found, PLANNER)
     assert action is not None and action.aside
-    # It is let go above the edge of the block, which spans 90 pixels.
+    # The place is near an edge of the block, which spans pixels 20 to 109 in both directions.
     row, col = GRID.to_pixel((action.place.x, action.place.y))
     assert min(abs(row - 19.5), abs(row - 109.5), abs(col - 19.5), abs(col - 109.5)) < 8
     assert ShapeMatchingPolicy(PLANNER)(wrong).reason == "nothing fits"

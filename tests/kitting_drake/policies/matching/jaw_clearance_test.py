@@ -1,4 +1,4 @@
-"""Grasps with enough room for the jaws in o_t, compared with the planner's motion."""
+"""Grasps for which o_t shows enough room for the jaws, as the planner moves them."""
 
 import dataclasses
 
@@ -16,7 +16,7 @@ HIGH, LOW = 0.040, 0.024
 
 
 def beside(distance: float) -> Observation:
-    """A 20 mm wide bar between two lower bars at the given distance from its centre."""
+    """A high bar, 20 mm wide, between two low bars that begin `distance` from its centre line."""
     image = np.zeros((4, *GRID.shape), np.float32)
     row, half, away = 80, round(0.010 / GRID.resolution), round(distance / GRID.resolution)
     image[3, row - half : row + half, 100:140] = HIGH
@@ -27,7 +27,7 @@ def beside(distance: float) -> Observation:
 
 
 def grasps_across(planner: PickPlaceParameters) -> int:
-    """The number of grasps near the high bar's centre, with fingers between the bars."""
+    """The number of grasps found near the high bar's centre; the fingers go between the bars."""
     seen = beside(0.035)
     segmentation = segment(seen)
     bar = max(segmentation.objects, key=lambda region: region.height)
@@ -56,5 +56,5 @@ def test_jaws_that_open_less_stay_clear_of_neighbours():
 @pytest.mark.parametrize("top", [0.012, 0.024, 0.045])
 def test_the_tip_height_is_that_of_the_planner(planner: PickPlaceParameters, top: float):
     expected = motion_heights(SurfaceHeights(pick_top=top), planner).grasp
-    # `tip_height` keeps a margin above the support.
+    # `tip_height` stays at least 3 mm above the support.
     assert tip_height(np.array(top), 0.0, planner) == pytest.approx(max(expected, 0.003))

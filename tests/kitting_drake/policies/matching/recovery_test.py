@@ -14,7 +14,7 @@ TOP = 0.05
 
 
 def observed(rise: float = 0.0) -> Observation:
-    """A fixture with an object `rise` above its top in a recess, and a loose object."""
+    """A loose object, and a fixture with an object in a recess, `rise` higher than the fixture."""
     height = np.zeros(GRID.shape, np.float32)
     height[40:120, 60:140] = TOP
     height[60:66, 75:125] = TOP - 0.02
@@ -60,7 +60,7 @@ def test_a_strongly_protruding_object_is_laid_on_the_table(rise: float):
     around = observed().height[row - 12 : row + 13, col - 12 : col + 13]
     assert around.shape == (25, 25)
     assert around.max() == 0
-    # After that grasp failed, another one is tried.
+    # If that grasp has failed, only a different one may be tried.
     other = mending(observed(rise), [action.pick])
     if other is not None:
         assert math.dist((other.pick.x, other.pick.y), (action.pick.x, action.pick.y)) > 0.019

@@ -13,7 +13,10 @@ GRID, PLANNER = PixelGrid(), PickPlaceParameters()
 
 
 def bar(blocked: float) -> Segmentation:
-    """A bar of 240 mm along x, hemmed in by blocks over a share of its length from its low end."""
+    """A bar of 240 mm along x; from its low end, blocks beside it leave no room for the jaws.
+
+    `blocked` is the fraction of the bar's length that has blocks beside it.
+    """
     image = np.full((4, *GRID.shape), 0.5, np.float32)
     image[3] = 0
     first, last = 30, 107
@@ -30,7 +33,10 @@ def bar(blocked: float) -> Segmentation:
     [(66, 0.0, 0), (60, 0.0, 1), (60, 0.45, 1), (40, 0.45, None)],
 )
 def test_a_refined_grasp_is_near_the_predicted_one(row: int, blocked: float, moves: int | None):
-    """It stays where it is nearly as good as any, moves along the bar, or is the network's own."""
+    """A nearly optimal grasp stays and another one moves along the bar, but not far.
+
+    If there is no good grasp nearby, None is returned, so that the network's own is used.
+    """
     found, pick = bar(blocked), np.array([row, 160.0])
     [region] = [item for item in found.objects if item.mask[100, 160]]
     assert jaw_grasps(found, region, GRID.resolution, PLANNER)

@@ -1,4 +1,4 @@
-"""Room for the fingers at release, on known heights."""
+"""Room for the fingers at release, computed from known heights."""
 
 import math
 
@@ -19,14 +19,17 @@ GRID = PixelGrid(x_min=0.3, y_min=-0.2, resolution=0.004, rows=97, cols=129, z_m
 PICK, PLACE = np.array([60, 25]), np.array([40, 90])
 CUBE = 0.040
 PAD = 0.005
-"""The height of the support at the place."""
+"""The height of the support at the place, in m."""
 SPACING = 0.052
-"""The distance between the centres of neighbours: less than the fingers need."""
+"""The distance between the centres of neighbouring cubes (m), too little for the fingers."""
 PLANNER = PickPlaceParameters()
 
 
 def heights(heading: float | None, lifted: float = 0.0) -> NDArray[np.float32]:
-    """A cube to pick and, with a heading, a neighbour of its place on either side along it."""
+    """Heights of a cube to pick and, if there is a heading, of the place's support and neighbours.
+
+    The neighbours are cubes on both sides of the place, along the heading.
+    """
     found = np.zeros(GRID.shape, np.float32)
     rows, cols = np.indices(GRID.shape)
 
@@ -62,7 +65,7 @@ def blocked(
 @pytest.mark.parametrize("lifted", [0.0, 0.040])
 def test_fingers_have_room_across_a_row_and_none_along_it(heading: float, lifted: float):
     found = heights(heading, lifted)
-    # At theta the jaws close along (-sin theta, cos theta).
+    # With the hand at theta, the jaws close along (-sin theta, cos theta).
     for half_turn in (0.0, math.pi):
         assert blocked(found, 0.0, heading + half_turn) == 0.0
         assert blocked(found, 0.0, heading + half_turn + math.pi / 2) > 0.1
@@ -72,9 +75,9 @@ def test_fingers_have_room_across_a_row_and_none_along_it(heading: float, lifted
 
 def test_opening_and_depth_are_those_of_the_planner():
     along = heights(0.0), 0.0, math.pi / 2
-    # A small opening keeps the fingertips farther from the neighbours.
+    # Fingers that open less at release stay farther from the neighbours.
     assert blocked(*along, PickPlaceParameters(release_clearance=0.001)) < blocked(*along) - 0.05
-    # A shallow grasp keeps the fingers above low neighbours.
+    # In a shallow grasp the fingers stay above the neighbours, which are lower than the cube.
     low = heights(0.0)
     low[low > CUBE + PAD / 2] = PAD + 0.024
     deep = PickPlaceParameters(grasp_depth=0.035, max_grasp_depth=0.035)
@@ -90,7 +93,7 @@ def test_nothing_is_blocked_on_a_bare_table_or_at_the_image_s_edge():
 
 
 class Cubes(Networks):
-    """Networks that predict a cube's place, up to quarter turns."""
+    """Networks that predict a cube's place; its four quarter turns score equally well."""
 
     def __init__(self) -> None:
         super().__init__(NetworkConfig(preset="tiny"))
@@ -134,7 +137,7 @@ def test_of_equally_good_rotations_the_one_with_room_is_taken(heading: float, co
 
 
 def test_a_worse_rotation_is_not_taken():
-    """An L fits in one rotation only, even next to neighbours."""
+    """An L fits in one rotation only, which is kept even where neighbours leave no room."""
 
     class Corner(Cubes):
         def encode_scene(self, image) -> torch.Tensor:

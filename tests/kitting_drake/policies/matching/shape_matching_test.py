@@ -55,7 +55,7 @@ def true_places(scene):
 
 
 def errors_of(action, scene) -> tuple[float, float]:
-    """The errors of the place, for the object nearest to the pick, in metres and radians."""
+    """The errors of an action's place, in metres and radians, if it picks the nearest object."""
     pick, place = (np.array([p.x, p.y]) for p in (action.pick, action.place))
     lies, belongs = min(true_places(scene), key=lambda o: math.dist(o[0][:2], pick))
     rotation = belongs[2] - lies[2]
@@ -98,7 +98,7 @@ def test_takes_out_a_protruding_object_only_when_nothing_else_fits(seen):
     observation, _ = seen
     segmentation = segment(observation)
     policy = ShapeMatchingPolicy(PLANNER, recover=True)
-    # An obstacle 40 mm above the fixture, where there is no recess.
+    # Something protrudes 40 mm above the fixture, where there is no recess.
     top = float(np.median(observation.height[segmentation.fixture]))
     rows, cols = np.nonzero(segmentation.fixture)
     image = observation.image.copy()
@@ -130,7 +130,7 @@ def test_stops_when_nothing_is_left(seen):
 
 
 def blind_networks() -> Networks:
-    """Networks that see nothing to pick, and prefer a corner."""
+    """Networks that predict no pick on any object, but at a corner of the image."""
     networks = load_networks(GENERALIST)
     predict = networks.predict_pick
 
@@ -175,13 +175,13 @@ def test_nothing_is_left_after_grasps_failed_everywhere(seen):
 def test_a_nearly_right_or_reversed_place_is_corrected(seen, turn: float):
     observation, scene = seen
     grid, segmentation = observation.grid, segment(observation)
-    # The second object is a screwdriver, whose recess is partly lost in noise.
+    # With noise, leave out the reversed second object: part of its recess is lost.
     for lies, belongs in true_places(scene)[: 1 if turn and not observation.valid.all() else 2]:
         pick, place = grid.to_pixel(lies[:2]), grid.to_pixel(belongs[:2])
         rotation = belongs[2] - lies[2]
         off = place + (1.1, -0.7)
         if turn:
-            # A network then predicts the recess's place the wrong way round.
+            # The predicted place is reversed about the recess's middle.
             recess = min(
                 segmentation.recesses,
                 key=lambda item: np.linalg.norm(item.pixels - place, axis=1).min(),
@@ -231,11 +231,11 @@ def test_a_grasp_without_room_moves_to_one_with_room(seen):
         near = refined(pick, theta)
         if near is not None:
             assert np.linalg.norm(near.pick - pick) * grid.resolution < 0.04
-        # Along the handle the jaws would close on nothing.
+        # Jaws that close along the handle would hold nothing, so such a grasp is turned.
         along = refined(pick, theta + math.pi / 2)
         assert along is not None
         assert abs(math.remainder(along.theta - theta, math.pi)) < math.radians(40)
-        # Failed grasps are avoided; if all failed, there is none.
+        # Failed grasps are avoided. If grasps failed everywhere, none is returned.
         other = refined(pick, theta + math.pi / 2, along.pick[None])
         if other is not None:
             assert np.linalg.norm(other.pick - along.pick) * grid.resolution > 0.0099
@@ -289,7 +289,7 @@ def kitted(request) -> Observation:
 
 @pytest.mark.slow
 def test_boxes_do_not_match_the_visible_parts_of_filled_recesses(kitted: Observation):
-    """These parts are narrow and match a box's side."""
+    """The visible parts are narrow and about as long as a box's side."""
     segmentation = segment(kitted)
     assert segmentation.recesses
     assert len(segmentation.objects) == 4
@@ -306,7 +306,7 @@ def test_tools_match_recesses_and_a_box_does_not(seen):
     segmentation = segment(observation)
     resolution = observation.grid.resolution
     assert len(match(segmentation, resolution)) == 4
-    # The largest square that fits into a recess.
+    # The box's base is the largest square that fits into a recess.
     box = np.zeros(segmentation.fixture.shape, bool)
     box[4:18, 4:18] = True
     recesses = dataclasses.replace(

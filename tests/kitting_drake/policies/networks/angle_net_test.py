@@ -19,9 +19,9 @@ from kitting_drake.policies.networks.layers.steerable import SteerableConv2d
 from tests.kitting_drake.policies.equivariance import rotate_image, smooth_image
 
 MEAN = AngleNetSize(stages=((4,), (6,), (6,), (6,)), kernel=3, readout=3)
-"""The output of the last layer is averaged, as in the paper."""
+"""A size with which the last layer's output is averaged over its pixels, as in the paper."""
 WHOLE = PRESETS["tiny"].angle
-"""The kernel of the last layer covers the whole feature map."""
+"""A size with which the last layer's kernel covers the whole feature map."""
 
 
 def angle_net(frequencies: tuple[int, ...], size: AngleNetSize = WHOLE) -> AngleNet:
@@ -30,7 +30,7 @@ def angle_net(frequencies: tuple[int, ...], size: AngleNetSize = WHOLE) -> Angle
 
 
 def rho(frequencies: tuple[int, ...], degrees: float) -> Tensor:
-    """rho_irrep of equations 1 and 4."""
+    """The matrix rho_irrep of a rotation, from equations 1 and 4."""
     blocks = []
     for j in frequencies:
         cos, sin = (f(j * math.radians(degrees)) for f in (math.cos, math.sin))
@@ -89,7 +89,7 @@ def test_other_rotations_are_nearly_exact(frequencies: tuple[int, ...], median: 
                 expected = output @ rho(frequencies, degrees).T
                 found = network(rotate_image(crop, degrees))
                 errors.append(float((found - expected).norm() / expected.norm()))
-    # Kernels of high frequency are the least exact on a grid.
+    # The bounds depend on the frequencies: high ones are less exact on a pixel grid.
     assert np.median(errors) < median
     assert np.max(errors) < most
 

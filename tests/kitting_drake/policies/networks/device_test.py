@@ -12,7 +12,7 @@ from kitting_drake.policies.networks import device
 
 @pytest.fixture(autouse=True)
 def forgotten() -> Iterator[None]:
-    """Clears the cached choice before and after each test."""
+    """Clears the cache of `preferred_type` before and after each test."""
     device.preferred_type.cache_clear()
     yield
     device.preferred_type.cache_clear()

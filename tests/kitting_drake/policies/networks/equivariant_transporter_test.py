@@ -43,7 +43,7 @@ def test_is_made_by_its_name():
 
 @pytest.mark.parametrize("name", ["alpha", "phi", "psi"])
 def test_encodings_are_equivariant_to_rotations_by_180_degrees(name: str):
-    # The only rotation of C_6, apart from 0, that needs no interpolation on a grid.
+    # Apart from 0, 180 degrees is the only rotation of C_6 that needs no interpolation on a grid.
     network = getattr(make_networks(TINY), name)
     image = torch.randn(1, 4, 33, 49)
     assert_near(network(image.rot90(2, (2, 3))), network(image).rot90(2, (2, 3)))
@@ -67,7 +67,7 @@ def test_angles_are_equivariant_to_rotations_by_90_degrees(orientations: int):
     ("orientations", "count"), [(36, 902_880), (72, 1_805_040), (120, 3_007_920), (180, 4_511_520)]
 )
 def test_the_paper_s_angle_network_has_the_authors_size(orientations: int, count: int):
-    # 0.90, 1.81, 3.01 and 4.51 million.
+    # The counts are 0.90, 1.81, 3.01 and 4.51 million.
     fibre = Regular(orientations, quotient=2)
     network = AngleNet(4, fibre, fibre, PRESETS["paper"].group_angle, GroupConv2d)
     assert sum(weight.numel() for weight in network.parameters()) == count
@@ -106,7 +106,7 @@ def losses(steps: int) -> list[dict[str, float]]:
     trainer = Trainer(make_networks(TINY), seed=0, learning_rate=1e-3)
     found = []
     for _ in range(steps):
-        # The same step number repeats the draws, including the motion of the scene.
+        # Random draws depend on the step number: with 0, every step moves the scene alike.
         trainer.step_count = 0
         found.append(trainer.step([sample()]))
     return found

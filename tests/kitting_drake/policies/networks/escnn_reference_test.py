@@ -14,7 +14,7 @@ from kitting_drake.policies.networks.methods import make_networks
 
 @pytest.fixture(scope="module")
 def both() -> tuple[Networks, Networks]:
-    """Our networks with nonzero biases, and the reference."""
+    """Our networks with nonzero biases, and escnn's with the same weights."""
     torch.manual_seed(0)
     ours = make_networks(NetworkConfig(preset="tiny"))
     assert isinstance(ours, SO2Networks)
@@ -46,7 +46,7 @@ def test_is_the_same_network(name: str, sides: tuple[int, int], both: tuple[Netw
     assert expected.std() > 0.01
     assert_close(found, expected)
 
-    # The gradient of every weight is also the same.
+    # Both have the same gradient of every weight.
     (expected**2).sum().backward()
     (found**2).sum().backward()
     pairs = list(zip(layers(ours, SteerableConv2d), layers(escnn, enn.R2Conv), strict=True))
@@ -55,7 +55,7 @@ def test_is_the_same_network(name: str, sides: tuple[int, int], both: tuple[Netw
         assert (one.bias is None) == (other.bias is None)
         if one.bias is not None:
             assert_close(one.bias.grad, other.bias.grad)
-    # Neither network has other parameters.
+    # Neither network has parameters outside these layers.
     for network, kind in ((ours, SteerableConv2d), (escnn, enn.R2Conv)):
         weights = itertools.chain.from_iterable(
             layer.parameters(recurse=False) for layer in layers(network, kind)
@@ -83,7 +83,7 @@ def test_inference_with_half_the_bits_is_near(both: tuple[Networks, Networks]):
         half = as_escnn(ours, torch.bfloat16).eval().alpha(image)
     assert half.dtype == torch.float32
     difference = float((half - expected).std() / expected.std())
-    # bfloat16 has eight bits of precision.
+    # bfloat16 has eight bits of precision, so the output differs, but little.
     assert 1e-4 < difference < 0.1
 
 

@@ -21,7 +21,10 @@ STEP = math.tau / ORIENTATIONS
 
 
 class ZeroNetworks(FactoredNetworks):
-    """Networks with zero logits, whose gradients reveal the labels. They store the last input."""
+    """Networks whose logits are all zero, so that the logits' gradients reveal the labels.
+
+    They store the last crops and logits.
+    """
 
     def __init__(self, *, stop: bool = False) -> None:
         super().__init__(config("so2", stop=stop))
@@ -39,14 +42,14 @@ class ZeroNetworks(FactoredNetworks):
         return self.logits
 
     def label(self) -> Tensor:
-        """The weight of each entry in a mean of cross-entropies, after `backward`."""
+        """The label of the last loss, recovered from the logits' gradient after `backward`."""
         assert self.logits.grad is not None
         count = 1 if self.logits.shape[0] == SIDE else len(self.logits)
         return count * (1 / self.logits.numel() - self.logits.grad)
 
 
 def two_tools() -> LabelledImage:
-    """A scene with another object, to be picked at bin 5, and one outside the image."""
+    """A scene with two more objects: one outside the image, and one whose pick angle is bin 5."""
     return dataclasses.replace(
         scene(0),
         other_picks=np.array([[-4.0, 30.0], [30.0, 70.0]]),
@@ -72,7 +75,7 @@ def test_a_stop_class_adds_the_presence_loss():
         dict(networks.losses(sample, np.random.default_rng(0)))["pick_position"]().item()
         for networks in (ZeroNetworks(), ZeroNetworks(stop=True))
     ]
-    # With zero logits, the odds are the number of pixels over exp(NOTHING_LOGIT).
+    # With zero logits, the odds of a pick are the number of pixels / exp(NOTHING_LOGIT).
     odds = SIDE**2 / math.exp(NOTHING_LOGIT)
     assert losses[1] - losses[0] == pytest.approx(math.log1p(1 / odds), rel=1e-4)
     stopping = ZeroNetworks(stop=True)
@@ -125,7 +128,7 @@ def test_crops_are_centred_near_the_label(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_the_place_label_follows_the_crop_s_centre(monkeypatch: pytest.MonkeyPatch):
-    """A crop beside the pick goes beside the place, rotated with the object."""
+    """The label of a crop beside the pick is as far from the place, in the rotated direction."""
     networks, sample = ZeroNetworks(), dataclasses.replace(scene(0), rotation=math.radians(-150.0))
     told: list[Any] = []
     monkeypatch.setattr(networks, "encode_scene", lambda image: "phi")

@@ -70,7 +70,7 @@ def test_a_label_on_a_pixel_or_bin_is_one_hot():
 def test_the_optimal_prediction_has_its_mean_at_the_label():
     logits = torch.randn(7, 9, requires_grad=True)
     (gradient,) = torch.autograd.grad(position_loss(logits, (3.25, 4.6)), logits)
-    # The gradient is the softmax minus the optimal prediction.
+    # The loss's gradient is the softmax minus the optimal prediction.
     best = logits.detach().flatten().softmax(0).view(7, 9) - gradient
     assert best.min() > -1e-6
     assert float(best.sum(1) @ torch.arange(7.0)) == pytest.approx(3.25, abs=1e-5)
@@ -96,7 +96,7 @@ def test_nothing_to_pick_is_an_additional_class():
     torch.testing.assert_close(
         presence_loss(odds, present=False), F.cross_entropy(classes, torch.tensor([63]))
     )
-    # Repeating the logits at every orientation does not change the odds.
+    # Logits that are repeated for every orientation give the same odds.
     torch.testing.assert_close(log_odds(logits.expand(6, -1, -1), 6), odds)
 
 
@@ -119,12 +119,12 @@ class Placing:
         self.volume = volume * (std / volume.std())
 
     def exact(self, pixel: tuple[float, float], rotation: float) -> float:
-        """The cross-entropy of equation 8 at all pixels and bins."""
+        """The cross-entropy of the volume of equation 8, with all pixels and bins."""
         label = (interpolate_label(rotation / STEP, N, cyclic=True), pixel)
         return float(joint_loss(self.volume, label))
 
     def coarse(self, pixel: tuple[float, float], rotation: float, seed: int) -> float:
-        """The part of `place_loss` for the coarse volume."""
+        """The part of `place_loss` that comes from the coarse volume."""
         phase = float(torch.rand(1, generator=torch.Generator().manual_seed(seed)))
         volume = coarse_volume(
             self.scene, self.encoding, rotation_angles(COARSE_ROTATIONS, self.scene, phase)
@@ -140,7 +140,7 @@ class Placing:
         return float(cross_entropy(volume, label))
 
     def estimated(self, pixel: tuple[float, float], rotation: float, seed: int) -> float:
-        """`place_loss` without the coarse part."""
+        """The value of `place_loss` without the coarse part."""
         generator = torch.Generator().manual_seed(seed)
         loss = place_loss(self.scene, self.encoding, pixel, rotation, N, generator)
         return float(loss) - self.coarse(pixel, rotation, seed)

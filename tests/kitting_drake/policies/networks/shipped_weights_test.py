@@ -24,17 +24,20 @@ ONE_OF_THEM = [
     for path in SHIPPED
 ]
 TAUGHT = [path for path in SHIPPED if path.stem != "generalist"]
-"""The weights that were trained on demonstrations."""
+"""The shipped weights that were trained on demonstrations: all but the generalist's."""
 OBSERVED = {"generalist": "kitting_unseen"}
-"""The rendered observation for each file (seeds 103 and 105, at rest, four tools on the table)."""
+"""The stored observation of weights that have none of their own name.
+
+Observations were rendered with seeds 103 and 105, at rest, with four tools on the table.
+"""
 
 GOLDEN = {
     "generalist": ((59.179, 219.931), 40.516, (69.985, 124.046), -146.184),
     "kitting_seen": ((19.879, 24.805), 57.140, (60.811, 177.621), -151.209),
     "kitting_unseen": ((59.612, 219.980), 41.040, (69.570, 123.653), -146.237),
 }
-"""The predictions of the shipped weights for these observations (float32): pick (row, col), pick
-angle in degrees, place (row, col), rotation in degrees."""
+"""The predictions of the shipped weights (float32) for their stored observations: pick (row, col),
+pick angle in degrees, place (row, col), rotation in degrees."""
 
 
 def test_there_is_a_file_for_each_task_and_a_generalist():
@@ -67,14 +70,14 @@ def test_no_test_seed_was_used_in_training(path: Path):
 
 
 def test_stops_when_all_tools_are_in_the_kit():
-    """On the last observation of a demonstration with a validation seed (20011)."""
+    """The first observation is the last one of a demonstration with a validation seed (20011)."""
     networks = load_networks(MODELS / "policies" / "kitting_unseen.safetensors")
     policy = LearnedPolicy(networks, orientations=36)
     names = ("kitting_unseen_final", "kitting_unseen")
     finished, unfinished = (policy(stored_observation(name)) for name in names)
     assert finished.stop
     assert not unfinished.stop
-    # Both log-odds are far from the threshold.
+    # Both log-odds are at least 2 from the threshold.
     odds = [policy.log_odds(stored_observation(name)) for name in names]
     assert odds[0] < networks.stop_threshold - 2 < networks.stop_threshold + 2 < odds[1]
 

@@ -309,7 +309,7 @@ def losses(steps: int) -> list[dict[str, float]]:
     trainer = Trainer(transporter(), seed=0, learning_rate=1e-3)
     found = []
     for _ in range(steps):
-        # The same step number repeats the draws, including the motion of the scene.
+        # Random draws depend on the step number: with 0, every step moves the scene alike.
         trainer.step_count = 0
         found.append(trainer.step([sample()]))
     return found

@@ -9,15 +9,15 @@ from systems.signals import Observation, PixelGrid
 
 GRID = PixelGrid()
 FLAT = (slice(40, 44), slice(30, 80))
-"""A flat object on the table, ..."""
+"""The pixels of a flat object on the table."""
 CAVITY = (slice(70, 74), slice(210, 260))
-"""... and its cavity."""
+"""The pixels of the object's cavity."""
 
 
 @pytest.mark.parametrize("noise", [0.0, pytest.param(0.001, marks=pytest.mark.slow), 0.002])
 @pytest.mark.parametrize("height", [0.008, 0.02])
 def test_flat_objects_and_cavities_are_whole_in_noise(noise: float, height: float):
-    """The ends of a region must survive, because they distinguish the half turn."""
+    """Noise must not cut off a region's ends, which tell an object from its half turn."""
     true = np.zeros(GRID.shape)
     true[50:130, 190:280] = 0.05
     true[FLAT], true[CAVITY] = height, 0.05 - height

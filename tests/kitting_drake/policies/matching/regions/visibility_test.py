@@ -27,7 +27,8 @@ def visibility(unseen: tuple[slice, slice], *, in_view: bool) -> Visibility:
 @pytest.mark.parametrize(
     ("unseen", "in_view", "theta", "good"),
     [
-        # The pick itself is hidden; or it is seen, with a hole under one finger, or both.
+        # Unseen within the view: the pick; below a finger; the same, but the hand is turned away;
+        # a small part below a finger.
         ((slice(78, 83), slice(158, 163)), True, 0.0, False),
         ((slice(75, 86), slice(172, 180)), True, 0.0, False),
         ((slice(75, 86), slice(172, 180)), True, np.pi / 2, True),
@@ -49,9 +50,9 @@ def test_picks_need_sight_of_what_the_jaws_sweep(
     ("place", "rotation", "good"),
     [
         ((80.0, 60.0), 0.0, True),
-        ((80.0, 3.0), 0.0, False),  # Half of the object would lie outside of the workspace.
-        ((80.0, 250.0), 0.0, False),  # Hidden.
-        ((80.0, 190.0), 0.0, False),  # It would reach into what is hidden ...
+        ((80.0, 3.0), 0.0, False),  # Half of the object would lie outside the workspace.
+        ((80.0, 250.0), 0.0, False),  # The place is hidden.
+        ((80.0, 190.0), 0.0, False),  # The object would reach into hidden pixels ...
         ((80.0, 190.0), np.pi / 2, True),  # ... unless it is rotated.
     ],
 )
@@ -66,7 +67,7 @@ def test_places_need_sight_of_where_the_object_will_lie(
 
 
 def kit_and_bar(hidden: tuple[slice, slice] | None) -> Observation:
-    """A kit with one recess, and the bar that belongs there; a part may be out of view."""
+    """A kit with one recess, and the bar that belongs there; `hidden` pixels are out of view."""
     image = np.full((4, *GRID.shape), 0.5, np.float32)
     height = image[3]
     height[:] = 0
@@ -83,7 +84,7 @@ def kit_and_bar(hidden: tuple[slice, slice] | None) -> Observation:
 def test_shape_matching_refuses_what_it_does_not_see():
     policy = ShapeMatchingPolicy(PLANNER)
     assert not policy(kit_and_bar(None)).stop
-    # The recess is seen, but not the bar, or the other way round.
+    # First the bar is hidden, then the recess.
     for hidden in ((slice(0, 160), slice(236, 320)), (slice(0, 160), slice(0, 94))):
         seen = kit_and_bar(hidden)
         action = policy(seen)

@@ -26,14 +26,14 @@ SIDE = 97
 
 
 def random_pair(seed: int, blur: int = 3) -> tuple[Tensor, Tensor]:
-    """A scene and an unrelated crop encoding, as smooth as those of the networks."""
+    """Encodings of a scene and of an unrelated crop, as smooth as those of the networks."""
     scene = smooth_image(113, seed=2 * seed, channels=3, blur=blur)
     encoding = smooth_image(SIDE, seed=2 * seed + 1, channels=3, blur=blur)
     return scene[:, :, 16:, 8:][:, :, : SCENE[0], : SCENE[1]], encoding
 
 
 def plain_volume(scene: Tensor, encoding: Tensor, orientations: int) -> Tensor:
-    """Equations 7 and 8, computed 30 rotations at a time."""
+    """The place volume by equations 7 and 8, computed for 30 rotations at a time."""
     parts = [
         cross_correlation_fft(scene, lift(encoding, angles, KERNEL))
         for angles in rotation_angles(orientations, scene).split(30)
@@ -134,7 +134,7 @@ def test_the_coarse_volume_approximates_the_full_correlation():
     coarse = coarse_volume(scene, encoding, angles)
     plain = cross_correlation(scene, lift(encoding, angles, KERNEL))[:, ::2, ::2]
     assert coarse.shape == plain.shape
-    # The coarse volume lacks the finest detail.
+    # The volumes differ a little, because the coarse one lacks the finest detail.
     assert (coarse - plain).std() < 0.1 * plain.std()
 
 
@@ -165,17 +165,17 @@ def test_the_search_finds_the_crop_in_the_scene(pixel: tuple[int, int], rotation
     scene = canvas[:, :, reach:-reach, reach:-reach]
     candidates, _ = search(scene, encoding, 72)
     _, found, row, col = candidates[0].best()
-    # At an edge half of the crop is unseen, and the rotation may be off by a bin.
+    # At an edge of the scene half of the crop is missing, so the rotation may be off by a bin.
     assert (row, col) == pixel
     assert (found - rotation + 36) % 72 - 36 in (-1, 0, 1)
 
 
 def test_of_windows_with_the_same_maximum_the_one_with_more_neighbours_is_kept():
-    """Sub-pixel refinement needs the maximum's neighbours."""
+    """Sub-pixel refinement needs the values around the maximum."""
     volume = torch.zeros(72, 20, 20)
     volume[70, 9, 9], volume[30, 2, 2] = 3.0, 5.0
     cut = Candidate(torch.cat([volume[66:], volume[:3]])[:, 1:10, 3:12], 66, (1, 3))
-    # The same maximum up to rounding, a full turn of bins away, with all its neighbours.
+    # This window has the maximum of `cut`, up to rounding and a full turn, and all its neighbours.
     whole = Candidate(volume[66:72, 5:14, 5:14] * (1 - 1e-6), 66 - 72, (5, 5))
     other = Candidate(volume[28:33, 0:7, 0:7], 28, (0, 0))
     for given in itertools.permutations([cut, whole, other]):

@@ -115,7 +115,7 @@ def test_keeps_gradients_and_type():
 
 
 def dense_maximum(coefficients: NDArray[np.float64], frequencies: tuple[int, ...]) -> float:
-    """Evaluates a dense grid of angles, then refines it around the best."""
+    """The angle of a series' maximum, by a search on a dense grid that is refined three times."""
     centre, reach = np.pi, np.pi
     for _ in range(4):
         angles = np.linspace(centre - reach, centre + reach, 2_001)
@@ -124,7 +124,7 @@ def dense_maximum(coefficients: NDArray[np.float64], frequencies: tuple[int, ...
     return float(centre)
 
 
-# For (1, 4) some seeds give two nearly equal maxima.
+# With frequencies (1, 4), some seeds give series that have two nearly equal maxima.
 @pytest.mark.parametrize("frequencies", [(0, 1), PAPER, QUOTIENT, (1, 4)])
 def test_the_maximum_equals_that_of_a_dense_search(frequencies: tuple[int, ...]):
     period = math.tau / math.gcd(*frequencies)

@@ -40,7 +40,7 @@ def test_analysis_undoes_synthesis(fibre: Fibre):
 
 
 def rotation(fibre: Fibre, steps: int) -> NDArray[np.float64]:
-    """(channels, channels): a rotation by `steps` times the angle between samples."""
+    """The matrix (channels, channels) of a rotation by `steps` times the angle between samples."""
     return np.roll(np.eye(fibre.channels), steps, axis=0)
 
 
@@ -48,7 +48,7 @@ def rotation(fibre: Fibre, steps: int) -> NDArray[np.float64]:
 def test_the_invariant_does_not_depend_on_rotation(fibre: Fibre):
     functional = fibre.invariant()
     np.testing.assert_allclose(functional @ rotation(fibre, 1), functional)
-    # It is the first coefficient, as in escnn's Fourier ELU.
+    # The invariant is the first coefficient, as in escnn's Fourier ELU.
     first = functional @ fibre.synthesis()
     if isinstance(fibre, Irreps):
         np.testing.assert_allclose(first, np.eye(fibre.size)[0], atol=1e-12)

@@ -90,7 +90,7 @@ def test_the_number_of_weights_is_proportional_to_the_group():
         fibre = Regular(order, quotient=2)
         return GroupConv2d(3, fibre, 5, fibre, 7).weights.numel()
 
-    # escnn has ten even circular harmonics on seven pixels.
+    # escnn's basis has ten circular harmonics of even order on kernels of seven pixels.
     assert [count(order) for order in (36, 72, 180)] == [3 * 5 * 10 * m for m in (18, 36, 90)]
 
 

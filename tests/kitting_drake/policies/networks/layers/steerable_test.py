@@ -27,12 +27,12 @@ def random_features(*shape: int) -> Tensor:
 
 
 def rotate_by_90(features: Tensor) -> Tensor:
-    """Rotates the image but not the fields."""
+    """Moves the pixels of a feature image by 90 degrees, but does not transform their fields."""
     return features.rot90(1, (2, 3))
 
 
 def rotate_fields(features: Tensor, fibre: Fibre, degrees: float = 90) -> Tensor:
-    """Transforms each field's channels but not the image."""
+    """Transforms the channels of each field by a rotation, but does not move the pixels."""
     if isinstance(fibre, Irreps):
         blocks = []
         for j in fibre.frequencies:
@@ -67,7 +67,7 @@ def test_rotations_by_90_degrees_are_exact(fibre_in: Fibre, fibre_out: Fibre, si
     expected = rotate_fields(rotate_by_90(layer(features)), fibre_out)
     found = layer(rotate_fields(rotate_by_90(features), fibre_in))
     torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-5)
-    # The output is not trivially zero.
+    # The outputs are not equal merely because they are zero.
     assert expected.std() > 0.1
 
 
@@ -107,7 +107,7 @@ def escnn_layers(fields: int) -> tuple[enn.R2Conv, enn.FourierELU, enn.R2Conv]:
 
 
 def copy_weights(source: enn.R2Conv, target: SteerableConv2d) -> None:
-    """escnn has the same order: out fields, in fields, basis."""
+    """Copies the weights of an escnn layer, which are in the same order as ours."""
     with torch.no_grad():
         target.weights.copy_(source.weights.view_as(target.weights))
 
@@ -128,7 +128,7 @@ def test_two_layers_equal_those_of_escnn():
     coefficients = torch.einsum("fs,nksxy->nkfxy", analysis, found.unflatten(1, (3, 8)))
     torch.testing.assert_close(coefficients.flatten(1, 2), expected, atol=1e-5, rtol=1e-5)
     assert expected.std() > 0.1
-    # escnn's layer ends with a projection onto the irreps, which is `BandLimit`.
+    # escnn's layer ends with a projection onto the irreps, as `BandLimit` does.
     synthesis = torch.from_numpy(SAMPLES.synthesis()).float()
     limited = torch.einsum("sf,nkfxy->nksxy", synthesis, expected.unflatten(1, (3, 7)))
     torch.testing.assert_close(
@@ -144,7 +144,7 @@ def test_the_initial_gain_does_not_depend_on_the_samples(samples: int):
     fibre = Irreps(FREQUENCIES, samples)
     layer = SteerableConv2d(32, fibre, 32, fibre, 3)
     features = BandLimit(fibre, 32)(random_features(1, 32 * samples, 32, 32))
-    # He initialisation's gain, which compensates the nonlinearity.
+    # He initialisation has a gain of sqrt(2), which makes up for the nonlinearity.
     gain = float(layer(features).detach().std() / features.std())
     assert gain == pytest.approx(2**0.5, rel=0.1)
 
@@ -164,7 +164,7 @@ def test_converts_to_a_plain_layer(bias: bool):
     half = plain(features.bfloat16())
     assert half.dtype == torch.bfloat16
     torch.testing.assert_close(half.float(), layer(features), atol=0.05, rtol=0.05)
-    # Computing in another type does not change the layer.
+    # The computation in bfloat16 did not change the layer's weights.
     for name, value in plain.state_dict().items():
         assert value.dtype == torch.float32
         assert torch.equal(value, before[name])
@@ -206,7 +206,7 @@ def test_gradients_of_resampling_equal_those_of_plain_operations(dtype: torch.dt
         gradients = []
         for way, precision in ((function, dtype), (plain, torch.float32)):
             leaf = features.clone().to(precision).requires_grad_()
-            # After a concatenation the gradient is a slice of a larger one.
+            # Because of the concatenation, the incoming gradient is a slice of a larger tensor.
             output = torch.cat([way(leaf), way(leaf.detach())], dim=1)
             output.backward(torch.cat([wanted, wanted], dim=1).to(precision))
             gradients.append(leaf.grad.float())
