@@ -20,7 +20,7 @@ pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).resolve().parents[2]
 
-# Two tools that must be shipped: one beside the scenario, one imported.
+# Its tools must be shipped to the nodes: one is beside the scenario, one was imported.
 SCENARIO = """
 Mine:
   time_limit: {time_limit}
@@ -31,7 +31,7 @@ Mine:
 
 @pytest.fixture
 def cluster() -> Iterator[Any]:
-    """A head node with one CPU."""
+    """A cluster that has only a head node, with one CPU."""
     utils = pytest.importorskip("ray.cluster_utils", reason="Ray is not installed")
     cluster = utils.Cluster(
         initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False}
@@ -42,7 +42,7 @@ def cluster() -> Iterator[Any]:
 
 @pytest.fixture
 def start(tmp_path: Path) -> Callable[..., subprocess.Popen[bytes]]:
-    """Starts a command on a scenario, with the folder of imported tools set."""
+    """Starts a command on a scenario in another process, which has the imported tool."""
     for place in (tmp_path / "imported" / "mine", tmp_path / "beside"):
         shutil.copytree(MODELS / "tools" / "combination_wrench", place)
 
@@ -61,7 +61,7 @@ def scenario_file(folder: Path, *, time_limit: float, tools: str) -> Path:
 
 
 def kill_node(cluster: Any, node: Any, process: subprocess.Popen[bytes], when: Callable) -> None:
-    """Kills a node at a random moment after a condition is met."""
+    """Kills a node at a random moment after `when` first returns true."""
     while not when():
         assert process.poll() is None, "the node was to be killed before the end"
         time.sleep(0.05)

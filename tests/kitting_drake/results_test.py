@@ -47,10 +47,10 @@ OURS = {
     "steps": 1234,
 }
 CLEAN = {"commit": "0123456789"}
-"""A clean commit: the tree of this test may have uncommitted changes."""
+"""Replaces the commit of the checkout, which may have uncommitted changes."""
 SEEN, UNSEEN = PAPER_TASKS
 OWN = SCENARIOS.parent / "docs" / "results"
-"""The results of this tree."""
+"""The folder of the project's results."""
 
 
 def write(
@@ -61,7 +61,7 @@ def write(
     seeds: range = range(5),
     **fields: Any,
 ) -> None:
-    """Adds a run of equal episodes, with some fields of its summary replaced."""
+    """Adds a run whose episodes all have these errors; `fields` replace those of its summary."""
     episodes = [make_episode(seed, errors_mm) for seed in seeds]
     chosen = replace(CHOSEN, scenario=scenario)
     summary = summarise(episodes, chosen, ADD_S, wall_seconds_total=1.0)
@@ -70,7 +70,7 @@ def write(
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Two runs: the oracle quantized to N = 36, and a network."""
+    """A folder with two runs: the oracle, quantized to N = 36, and networks."""
     quantized = Scenario(policy=QuantizedOracle(orientations=36))
     write(tmp_path, "quantized", quantized, [1.0, 9.0, 1.0, 1.0])
     objects = [make_object(name, 1.0) for name in ("cup", "bolt", "ring")]
@@ -82,7 +82,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def spoil(folder: Path, name: str, **fields: Any) -> None:
-    """Replaces fields of a run."""
+    """Replaces fields of a run's summary in a folder."""
     summary = read_summaries(folder)[name] | fields
     remove_runs(folder, [name])
     add_run(folder, name, summary)
@@ -93,7 +93,7 @@ def page(folder: Path) -> str:
 
 
 def tables(page: str) -> dict[str, list[list[list[str]]]]:
-    """The cells of all tables by heading, without the rules."""
+    """The tables below each heading, as lists of rows of cells, without the rules."""
     found: dict[str, list[list[list[str]]]] = {}
     heading, before = "", ""
     for line in page.splitlines():
@@ -109,7 +109,7 @@ def tables(page: str) -> dict[str, list[list[list[str]]]]:
 
 
 def successes(page: str, task: str) -> dict[tuple[str, ...], list[str]]:
-    """Success rates of a task by method, preset and number of demonstrations."""
+    """The success rates of a task for each N, by method, preset and number of demonstrations."""
     (heading,) = (name for name in tables(page) if name.endswith(f"(`{task}`)"))
     (table,) = tables(page)[heading]
     assert table[0][3:] == [f"N = {n}" for n in (36, 72, 120, 180)]
@@ -148,7 +148,7 @@ DENSE = Scenario(task=ToolsetKitting(split="test"), heightmap=Heightmap(resoluti
         (Scenario(random_seed=7, target_realtime_rate=1.0), SEEN, ""),
         (Scenario(task=ToolsetKitting(split="test")), UNSEEN, ""),
         (EASY, None, "`task.success_threshold: 0.01`"),
-        # The title of a task alone is not enough.
+        # These tasks have the title of a task of the paper, but differ from it.
         (DENSE, None, "`heightmap.resolution: 0.002`"),
         (Scenario(task=ToolsetKitting(split="train")), None, '`task.split: "train"`'),
         (Scenario(task=ToolsetKitting(split="fresh")), None, '`task.split: "fresh"`'),
@@ -174,7 +174,7 @@ def test_a_run_is_the_papers_only_if_nothing_but_the_policy_differs(
 
 
 def test_a_field_that_a_run_did_not_have_is_a_difference(tmp_path: Path):
-    """A task with another default is another task."""
+    """A run that lacks a field may have had another value than the field's default."""
     write(tmp_path, "run", Scenario(task=ToolsetKitting()), [1.0])
     found = read_summaries(tmp_path)["run"]["resolved_scenario"]
     del found["task"]["random_lengths"]
@@ -292,7 +292,7 @@ def test_errors_name_the_invalid_run(folder: Path, tmp_path: Path):
 
 
 def command(monkeypatch: pytest.MonkeyPatch, folder: Path, *words: str) -> str:
-    """Runs the verb; returns the protocol that it writes."""
+    """Runs `results`; returns the text of the protocol that it writes."""
     output = folder / "docs" / "results.md"
     arguments = ["results", "--results", str(folder), "--output", str(output), *words]
     monkeypatch.setattr(sys, "argv", arguments)
@@ -365,7 +365,7 @@ def own_runs() -> list[Run]:
 
 
 def test_own_runs_are_consistent(own_runs: list[Run]):
-    """Renamed fields of a scenario do not matter."""
+    """Runs whose scenarios have fields that were renamed later are assigned to their cells, too."""
     for run in own_runs:
         rates = [item["success_rate"] for item in run.summary.get("outcomes", ())]
         assert not rates or np.mean(rates) == pytest.approx(run.summary["success_rate"])

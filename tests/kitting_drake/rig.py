@@ -1,4 +1,4 @@
-"""A station with its scenario's policy connected, for tests."""
+"""Stations for tests, each connected to its scenario's policy."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from systems.placement import PlacedObject
 @dataclass(frozen=True)
 class Rig:
     diagram: Diagram
-    """The root diagram."""
+    """The diagram of the station and the policy."""
     station: KittingStation
 
     @property
@@ -35,7 +35,10 @@ class Rig:
         return self.station.objects
 
     def port(self, name: str, root: Context | None = None) -> Any:
-        """The value of a port of the station, by default in the initial context."""
+        """The value of a port of the station: of the input `action`, or of an output.
+
+        Without `root`, it is the value in the default context.
+        """
         root = self.diagram.CreateDefaultContext() if root is None else root
         context = self.station.GetMyContextFromRoot(root)
         if name == "action":
@@ -45,7 +48,7 @@ class Rig:
     def run(
         self, *observers: EpisodeObserver, seconds: float | None = None, name: str = "test"
     ) -> EpisodeResult:
-        """Runs an episode, of at most `seconds` of simulated time."""
+        """Runs an episode of at most `seconds` of simulated time, or the scenario's time limit."""
         if seconds is not None:
             scenario = dataclasses.replace(self.station.scenario, time_limit=seconds)
             self.station.scenario = scenario

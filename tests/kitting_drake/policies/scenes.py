@@ -14,14 +14,14 @@ from systems.signals import Observation, PixelGrid
 SIDE = 113
 ORIENTATIONS = 36
 ROOM = 8
-"""How far a rotated scene may be shifted, in pixels; at most the tip of a corner leaves it."""
+"""The largest shift of a rotated scene (pixels); at most a corner's tip then leaves the image."""
 
 _BLOCK = 4.0
 """The side of a block, in pixels."""
 _APART = 22
-"""The distance of the tool and of the recess from the centre of the image, in pixels."""
+"""The distance from the image's centre to the tool, and to the recess, in pixels."""
 _FINE = 4
-"""The number of samples per pixel along each axis; a pixel is their mean, as in a camera."""
+"""The number of samples per pixel along each axis; a pixel is the mean of its samples."""
 
 _Blocks = frozenset[tuple[int, int]]
 _HANDLE: _Blocks = frozenset((i, 0) for i in range(-4, 1))
@@ -43,7 +43,7 @@ def stored_observation(name: str) -> Observation:
 
 
 def config(method: str, *, stop: bool = False) -> NetworkConfig:
-    """The smallest networks, normalised to make empty pixels zero, as outside the image."""
+    """The config of the smallest networks, with a normalisation that keeps empty pixels zero."""
     return NetworkConfig(
         method=method,
         preset="tiny",
@@ -57,23 +57,23 @@ def config(method: str, *, stop: bool = False) -> NetworkConfig:
 
 
 def scene(seed: int, degrees: float = 0.0) -> LabelledImage:
-    """A scene that is rendered anew at every rotation instead of resampled.
+    """A scene at some rotation, for which it is rendered, not resampled.
 
     The tool is picked at its neck, along its handle. Without rotation the labels lie on pixels and
     bins.
 
     Args:
-        seed: of the tool and all poses.
-        degrees: of the rotation about the centre, counter-clockwise.
+        seed: the random seed of the tool and of all poses.
+        degrees: the rotation of the scene about its centre, counter-clockwise.
     """
     return _scene(seed, degrees, placed=False)
 
 
 def final_scene(seed: int, degrees: float = 0.0) -> Image:
-    """The same scene after the tool was placed into its recess, with nothing left to pick.
+    """The image of `scene` after the tool was placed into its recess; nothing is left to pick.
 
     Returns:
-        (4, SIDE, SIDE).
+        Colours and heights (4, SIDE, SIDE).
     """
     return _scene(seed, degrees, placed=True).image
 
@@ -107,7 +107,7 @@ def _scene(seed: int, degrees: float, *, placed: bool) -> LabelledImage:
 
 
 def _tool(random: np.random.Generator) -> _Blocks:
-    """A handle and a head of three blocks without mirror symmetry."""
+    """A random tool without mirror symmetry: a handle, and a head of three blocks."""
     while True:
         chosen = random.choice(len(_BESIDE), 2, replace=False)
         head = {_BESIDE[index] for index in chosen}
@@ -116,7 +116,7 @@ def _tool(random: np.random.Generator) -> _Blocks:
 
 
 def _filled(centre: NDArray[np.float64], angle: float, blocks: _Blocks) -> NDArray[np.bool_]:
-    """(SIDE * _FINE, SIDE * _FINE): the mask of samples inside rotated blocks around a centre."""
+    """The mask of samples (SIDE * _FINE, SIDE * _FINE) inside blocks, rotated about `centre`."""
     points = (np.arange(SIDE * _FINE) + 0.5) / _FINE - 0.5
     grid = np.stack(np.meshgrid(points, points, indexing="ij"), axis=-1)
     row, col = np.rint((grid - centre) @ rotation_matrix(angle) / _BLOCK).astype(int).clip(-6, 6).T

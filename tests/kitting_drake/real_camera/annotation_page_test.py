@@ -1,4 +1,4 @@
-"""The annotation page's server, with the requests of a browser."""
+"""The annotation page's server answers requests like those of a browser."""
 
 import http.client
 import io
@@ -63,7 +63,7 @@ def get(server: AnnotationServer, path: str) -> bytes:
 def post(
     server: AnnotationServer, path: str, content: Any, kind: str = "application/json"
 ) -> tuple[int, Any]:
-    """The status and the JSON of the response."""
+    """Posts content to the server; returns the response's status and JSON."""
     data = content if isinstance(content, bytes) else json.dumps(content).encode()
     request = urllib.request.Request(server.url + path, data, {"Content-Type": kind})
     try:
@@ -133,12 +133,12 @@ def test_invalid_actions_are_rejected(
 
 
 def test_other_origins_are_rejected(server: AnnotationServer, folder: Path):
-    """A foreign page can send text without permission, and its host name may point here."""
+    """A browser lets other sites send plain text here, and their host names may point here."""
     assert post(server, "steps/0", POSES, "text/plain")[0] == 403
     connection = http.client.HTTPConnection(*server.server_address)
     connection.request("GET", "/steps", headers={"Host": "elsewhere.example:80"})
     assert connection.getresponse().status == 403
-    # A browser omits port 80.
+    # If the port is 80, a browser omits it.
     connection = http.client.HTTPConnection(*server.server_address)
     connection.request("GET", "/steps", headers={"Host": "localhost"})
     assert connection.getresponse().status == 200

@@ -1,4 +1,4 @@
-"""Frames from files of every kind: each is read as the tool that writes it meant it."""
+"""Frames are read from every kind of file, with the meaning that the writing tool gives it."""
 
 import base64
 import dataclasses
@@ -129,7 +129,7 @@ def write_text_pcd(folder: Path) -> None:
 
 
 def write_binary_pcd(folder: Path) -> None:
-    """As PCL writes an organised cloud: colours are the bits of a float."""
+    """Writes an organised cloud as PCL does, with colours packed into the bits of a float."""
     table = np.column_stack([POINTS.astype("<f4"), packed().view("<f4")])
     data = (ORGANISED_HEADER + "DATA binary\n").encode() + table.astype("<f4").tobytes()
     (folder / "front.pcd").write_bytes(data)
@@ -178,7 +178,7 @@ def test_steps_of_16_bits_have_the_calibrated_scale(tmp_path: Path):
 
 
 def test_an_unorganised_cloud_is_projected(tmp_path: Path):
-    """Without some points and in another order; of two on a ray the nearer one is seen."""
+    """The cloud lacks points and is shuffled; of two points on a ray, the nearer one is seen."""
     order = np.random.default_rng(0).permutation(48)[:40]
     points = np.vstack([POINTS[order], 1.5 * POINTS[order[:5]]])
     colors = np.vstack([COLOR.reshape(-1, 3)[order], np.zeros((5, 3), np.uint8)])
@@ -197,7 +197,7 @@ def test_an_unorganised_cloud_is_projected(tmp_path: Path):
 
 
 def test_colour_of_another_lens_is_registered(tmp_path: Path):
-    """A plane at 0.8 m, seen by a colour camera 40 mm to the right with twice the resolution."""
+    """The colour camera is 40 mm to the right and has twice the resolution; a plane is at 0.8 m."""
     lens = Intrinsics((16, 12), (20.0, 20.0), (7.75, 5.5))
     X_KC = np.eye(4)
     X_KC[0, 3] = -0.04
@@ -209,7 +209,7 @@ def test_colour_of_another_lens_is_registered(tmp_path: Path):
     depth[0, 3] = 0
     np.save(tmp_path / "depth.npy", depth)
     frame = read(tmp_path, camera=camera)
-    # The point of column c is at x = 0.08 (c - 3.5), and the colour camera sees it at 2 c - 0.25.
+    # Depth column c sees the point at x = 0.08 (c - 3.5), which is in colour column 2 c - 0.25.
     columns = np.rint(20 * (0.08 * (np.arange(W) - 3.5) - 0.04) / 0.8 + 7.75).astype(int)
     assert columns.tolist() == [0, 2, 4, 6, 8, 10, 12, 14]
     np.testing.assert_array_equal(frame.color[3, :, 0], 10 + 16 * columns)

@@ -1,4 +1,4 @@
-"""Frames of the simulated cell's cameras, as files and as a bench has them."""
+"""Frames of the simulated cell's cameras in the form of a real bench's, and as files."""
 
 import dataclasses
 import math
@@ -32,7 +32,7 @@ class Rendered:
 
     frames: dict[str, Frame]
     calibration: Calibration
-    """With the poses that the cell assumes."""
+    """The cameras' calibration, with the poses that the cell assumes."""
     rig: Rig
     context: Context
 
@@ -47,7 +47,7 @@ class Rendered:
 
 
 def render(scenario: Scenario, seed: int, *, rig: Rig | None = None) -> Rendered:
-    """The frames that the cell's policy would see first."""
+    """Renders the frames from which the cell's policy would decide first."""
     rig = rig or build_rig(scenario, seed=seed, base=ROOT / "scenarios")
     context = rig.diagram.CreateDefaultContext()
     frames, poses = take_frames(rig.station, rig.station.GetMyContextFromRoot(context))
@@ -56,7 +56,7 @@ def render(scenario: Scenario, seed: int, *, rig: Rig | None = None) -> Rendered
 
 
 def write_frames(folder: Path, frames: dict[str, Frame], depth: str = "npy") -> Path:
-    """Writes `NAME_color.png`, and `NAME_depth.npy` in m or `NAME_depth.png` in mm."""
+    """Writes colours as PNG, and depths as `NAME_depth.npy` (m) or `NAME_depth.png` (mm)."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, frame in frames.items():
         Image.fromarray(frame.color).save(folder / f"{name}_color.png")
@@ -69,9 +69,12 @@ def write_frames(folder: Path, frames: dict[str, Frame], depth: str = "npy") -> 
 
 
 def difference(one: PickPlaceAction, other: PickPlaceAction) -> NDArray[np.float64]:
-    """(3,): the distance of two picks in mm, the distance of the picked point's places in mm, and
-    the difference of the object's rotations in degrees. Different grasps of an object agree in the
-    last two if they move it alike."""
+    """How two actions differ, as an array (3,).
+
+    It holds the distance between the picks (mm), the distance between the places to which they
+    bring the second action's picked point (mm), and the difference between the rotations of the
+    object (degrees). The last two are zero if different grasps move an object alike.
+    """
     turned, other_turned = (item.place.theta - item.pick.theta for item in (one, other))
     c, s = math.cos(turned), math.sin(turned)
     x, y = other.pick.x - one.pick.x, other.pick.y - one.pick.y
@@ -86,8 +89,10 @@ def difference(one: PickPlaceAction, other: PickPlaceAction) -> NDArray[np.float
 
 
 def true_action(found: Rendered, action: PickPlaceAction) -> tuple[str, PickPlaceAction]:
-    """The name of the object that is picked, and the action that would bring it exactly to its
-    goal."""
+    """The name of the object that an action picks, and the action with the exact place.
+
+    With the exact place, the object would reach its goal.
+    """
     pick = np.array([action.pick.x, action.pick.y])
     scene = found.rig.scene
 
@@ -107,7 +112,7 @@ def true_action(found: Rendered, action: PickPlaceAction) -> tuple[str, PickPlac
 
 
 def cast(calibration: Calibration, block: Block | None = None) -> dict[str, Frame]:
-    """Frames of a table, empty or with a block, by exact ray casting."""
+    """Frames of a table, empty or with a block, computed by exact ray casting."""
     frames = {}
     for camera in calibration.cameras:
         u, v = np.broadcast_arrays(camera.rays.u, camera.rays.v)
@@ -125,7 +130,7 @@ def cast(calibration: Calibration, block: Block | None = None) -> dict[str, Fram
 def _entered(
     block: Block, origin: NDArray[np.float64], rays: NDArray[np.float64], table: float
 ) -> NDArray[np.float64]:
-    """The depth at which rays enter a block; NaN for rays that miss it."""
+    """The depth at which each ray enters a block; NaN for rays that miss the block."""
     assert block.pose is not None
     x, y, yaw = block.pose
     R = np.array([[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]])

@@ -1,4 +1,4 @@
-"""The frame in models/sample_frame is decided rightly, without Drake."""
+"""The action for the frame in models/sample_frame is right, and is found without Drake."""
 
 import json
 import math
@@ -32,8 +32,11 @@ def test_it_is_small_and_names_no_machine():
 
 
 def errors(action: PickPlaceAction) -> tuple[float, float, float]:
-    """The distance of the pick from the nearest tool in m, that of the picked point from its place
-    in m, and the error of the tool's yaw in rad."""
+    """The errors of an action, judged by the nearest tool.
+
+    They are the distance between the pick and the tool (m), the distance between the action's place
+    and the one that brings the tool into a cavity (m), and the error of the tool's yaw (rad).
+    """
     pick = np.array([action.pick.x, action.pick.y])
     found = []
     for tool in json.loads((SAMPLE / "truth.json").read_text()).values():
@@ -43,7 +46,7 @@ def errors(action: PickPlaceAction) -> tuple[float, float, float]:
         ahead = action.place.theta - action.pick.theta + yaw
         for place in tool["places"]:
             off = math.remainder(ahead - place[2], math.tau / tool["symmetry"])
-            # Where the picked point goes if the tool lands in its place.
+            # The picked point goes here if the tool lands exactly in this place.
             goal = turned(local, ahead - off) + place[:2]
             miss = math.dist(goal, (action.place.x, action.place.y))
             found.append((away, miss, abs(off)))
@@ -92,7 +95,7 @@ def test_its_table_is_found():
     grid = found.calibration.grid
     assert grid.shape == (160, 320)
     assert (grid.x_min, grid.y_min) == pytest.approx((0.25, -0.5), abs=0.02)
-    # Everything lies on it.
+    # All tools and their places are on the table that was found.
     for tool in json.loads((SAMPLE / "truth.json").read_text()).values():
         poses = np.array([tool["pose"], *tool["places"]])
         assert found.calibration.contains(poses[:, :2]).all()

@@ -27,14 +27,14 @@ METHODS = {
     "Transporter": "transporter",
 }
 POLICIES = ("so2_small_180_100", "generalist", "shape_matching")
-"""The policies in the names of runs, in the order of the columns on robustness."""
+"""The policies, as in the names of runs, in the order of the columns of docs/robustness.md."""
 STRICT, OWN = 2, 1
-"""The least outcome that counts as a success."""
+"""The least outcome that counts as a success by the strict measure, and by a task's own."""
 
 
 @pytest.fixture(scope="module")
 def runs() -> dict[str, Summary]:
-    """The runs whose code can be checked out."""
+    """The runs, by name, that come from a clean commit."""
     found = read_summaries(RESULTS)
     return {name: run for name, run in found.items() if is_reproducible(run["commit"])}
 
@@ -45,7 +45,7 @@ def readme() -> str:
 
 
 def rows(page: str, *sections: str) -> list[list[str]]:
-    """The cells of all tables of a section, or of a whole page, by line."""
+    """The cells of all tables of a page, or of one of its sections, as a list for each line."""
     for section in sections:
         page = page.split(section, 1)[1]
     lines = page.split("\n#", 1)[0].splitlines() if sections else page.splitlines()
@@ -62,13 +62,13 @@ def half_up(value: float) -> int:
 
 
 def counts(found: list[Summary], least: int = STRICT) -> tuple[int, int]:
-    """The number of successful objects, and of all objects."""
+    """The number of successful objects, and the number of all objects."""
     ends = [end for run in found for item in run["outcomes"] for end in item["objects"].values()]
     return sum(end >= least for end in ends), len(ends)
 
 
 def wilson(good: int, objects: int) -> tuple[float, float]:
-    """The 95 % interval of a share."""
+    """The 95 % Wilson interval of `good / objects`."""
     z, share = 1.959963984540054, good / objects
     middle = share + z**2 / (2 * objects)
     half = z * math.sqrt(share * (1 - share) / objects + z**2 / (4 * objects**2))
@@ -76,19 +76,22 @@ def wilson(good: int, objects: int) -> tuple[float, float]:
 
 
 def share(found: list[Summary], least: int = STRICT) -> str:
-    """The share of objects and its interval, in the format of README.md."""
+    """The share of objects that were placed, with at least the outcome `least`, and its interval.
+
+    In the format of README.md.
+    """
     good, objects = counts(found, least)
     low, high = wilson(good, objects)
     return short(f"{100 * good / objects:.1f} ({100 * low:.1f} to {100 * high:.1f})")
 
 
 def short(text: str) -> str:
-    """In the format of README.md, which shows 100.0 as 100."""
+    """A text in the format of README.md, which shows 100.0 as 100."""
     return text.replace("100.0", "100")
 
 
 def reward(run: Summary) -> str:
-    """The mean reward of a run and its interval."""
+    """The mean reward of a run and its interval, in per cent."""
     rate = np.mean([item["success_rate"] for item in run["outcomes"]])
     low, high = run["ci95"]
     return f"{100 * rate:.1f} ({100 * low:.1f} to {100 * high:.1f})"
@@ -100,7 +103,7 @@ def percent(runs: dict[str, Summary], name: str) -> int:
 
 @pytest.fixture(scope="module")
 def headline(readme: str) -> list[list[str]]:
-    """The table of results in README.md, without its headings."""
+    """The rows of the table of results in README.md, without its head."""
     return [row for row in rows(readme, "## Results") if len(row) == 5][2:]
 
 

@@ -36,7 +36,7 @@ MEASURES = {"training_step", "alpha_training_step", "decision", "alpha_inference
 
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """The smallest benchmark, on a demonstration with a small image."""
+    """The results of the smallest benchmark, on a demonstration with a small image."""
     torch.set_num_threads(1)
     path = tmp_path_factory.mktemp("benchmark") / "demonstrations.h5"
     x, y = GRID.to_world((16.0, 24.0))
@@ -97,7 +97,7 @@ def test_only_the_equivariant_transporter_grows_in_parameters(measured: dict[str
     assert growth["so2"]["from"] == 26
     assert growth["so2"]["to"] == 30
     assert growth["so2"]["parameters"] == 1
-    # Only its discretization depends on N.
+    # In our angle network, only the discretization depends on N, which costs little.
     assert growth["so2"]["operations"] == pytest.approx(1, abs=1e-3)
     assert growth["equivariant_transporter"]["parameters"] == pytest.approx(30 / 26, rel=0.05)
     assert growth["equivariant_transporter"]["operations"] == pytest.approx((30 / 26) ** 2, rel=0.1)
@@ -111,7 +111,7 @@ def test_a_decision_is_the_sum_of_its_parts(measured: dict[str, Any]):
         parts = dict(row["parts"])
         assert set(parts) == {"pick_position", "pick_angle", "phi", "psi", "search"}
         assert sum(parts.values()) <= row["slowest"]
-        # The Transporter has one network for both position and angle.
+        # The Transporter predicts position and angle in one network, so the angle takes no time.
         joint = parts.pop("pick_angle") == 0
         assert joint == (row["method"] == "transporter")
         assert all(seconds > 0 for seconds in parts.values())
@@ -125,7 +125,7 @@ def test_the_transporter_encodes_every_rotated_crop(measured: dict[str, Any]):
         for row in measured["pick_angle"]
         if row["method"] == "transporter"
     }
-    # Besides picking, phi is computed once and psi N times.
+    # Apart from the picking network, a decision computes phi once and psi N times.
     placing = [row["operations"] - angle[row["orientations"]] for row in (few, many)]
     crop = (placing[1] - placing[0]) / (30 - 26)
     assert placing[0] - 26 * crop > 0
@@ -147,7 +147,7 @@ def test_folding_computes_the_same_function(measured: dict[str, Any]):
         assert all(value > 0 for value in share.values())
     assert set(folding["speed_up"]["escnn_float32"].values()) == {1.0}
     assert folding["alpha_difference"]["ours_float32"] < 1e-4
-    # Each field has eight samples instead of seven coefficients.
+    # Our fields have eight samples each, escnn's have seven coefficients.
     operations = folding["alpha_operations"]
     assert 1 < operations["ours"] / operations["escnn"] < (8 / 7) ** 2
 
@@ -169,7 +169,7 @@ def test_levels_include_all_layers(measured: dict[str, Any]):
     levels, layers = measured["alpha_levels"]["levels"], measured["alpha_levels"]["layers"]
     blocks = [f"down {i}" for i in range(1, 6)] + [f"up {i}" for i in range(1, 5)]
     assert [row["level"] for row in levels] == ["input", *blocks, "head"]
-    # 21 layers and the shortcut convolutions.
+    # There are 21 layers, and some shortcuts that are convolutions.
     assert len(layers) == 21 + sum(row["layer"].endswith("shortcut") for row in layers)
     assert sum(row["operations"] for row in layers) == sum(row["operations"] for row in levels)
     for row in levels:
@@ -270,7 +270,7 @@ def test_time_each_stops_when_the_budget_is_spent():
 def test_if_warming_up_spends_the_budget_the_last_run_counts(
     monkeypatch: pytest.MonkeyPatch,
 ):
-    clock = iter([0.0, 3.0, 10.0, 11.0])  # Two runs, of 3 s and 1 s.
+    clock = iter([0.0, 3.0, 10.0, 11.0])  # The first run takes 3 s, the second 1 s.
     monkeypatch.setattr(timing, "read_clock", lambda _: next(clock))
     timings = time_each({"a": lambda: None}, torch.device("cpu"), repeats=5, budget=3.5)
     assert timings["a"] == timing.Timing.of([1.0])

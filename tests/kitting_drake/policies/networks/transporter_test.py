@@ -103,7 +103,7 @@ def test_has_43_layers():
     assert sum("shortcut" not in name for name in layers) == 43
     image = torch.randn(1, 4, 33, 49)
     assert network(image).shape == (1, 3, 33, 49)
-    # Three stages have a stride of two.
+    # Of the four stages, three halve the image.
     sides = []
     halved = network.stem(image)
     for stage in network.down:
@@ -118,7 +118,7 @@ def test_the_volume_is_equivariant_to_rotations_by_90_degrees():
     image = sample().image
     volume = networks.pick_volume(image, N)
     assert volume.shape == (N // 2, *image.shape[1:])
-    # The network does not know that angles beyond pi repeat.
+    # Only half of the bins are compared: the network does not know that angles repeat beyond pi.
     found = networks.pick_volume(np.rot90(image, axes=(1, 2)).copy(), N)[N // 4 :]
     expected = volume[: N // 4].rot90(1, (1, 2))
     assert expected.std() > 1e-3
@@ -135,7 +135,7 @@ def test_picks_the_maximum_of_the_volume():
     angles = picking.angle((row, col)).logits
     assert angles.shape == (N // 2,)
     assert angles.max() == volume.max()
-    # N is not part of the architecture.
+    # The same networks serve any N: every second bin of N = 16 is a bin of N = 8.
     finer = networks.predict_pick(image, 16).angle((row, col)).logits
     torch.testing.assert_close(finer[::2], angles)
     with pytest.raises(ValueError, match="even"):
@@ -160,14 +160,14 @@ def test_position_and_angle_share_one_volume_that_is_not_cached(
     angles = before.angle((20, 30)).logits
     assert len(computed) == N // 2
     assert angles.max() == before.position[20, 30]
-    # The same array may hold another image later.
+    # The networks must notice that the same array holds another image.
     image[:] = image[:, ::-1].copy()
     assert not torch.equal(networks.predict_pick(image, N).position, before.position)
 
 
 @pytest.mark.parametrize("angle", ANGLES)
 def test_crops_are_those_of_the_rotated_scene(angle: float):
-    """A point is rotated about the pick, which is the crop's centre."""
+    """The scene is rotated about the pick, which becomes the crop's centre."""
     pixel, point = (50, 70), np.array([58.0, 49.0])
     scene = blob((101, 121), (point[0], point[1]))
     (found,) = rotated_crops(scene, pixel, [angle])
@@ -192,7 +192,7 @@ def test_places_at_the_maximum_of_the_correlation_with_all_rotated_crops(orienta
     placing = networks.predict_place(image, pixel, orientations)
     angles = [i * math.tau / orientations for i in range(orientations)]
     kernels = networks.encode_crops(image, pixel, angles)
-    # Rotating a crop differs from rotating its encoding.
+    # Encoding a rotated crop differs from rotating the crop's encoding.
     rotated_encodings = lift(networks.encode_crop(image, pixel), torch.tensor(angles), KERNEL)
     assert (kernels[1:] - rotated_encodings[1:]).norm() > 0.01 * kernels[1:].norm()
     volume = cross_correlation(networks.encode_scene(image), kernels)[:, :rows, :cols]
@@ -221,7 +221,7 @@ def test_more_than_36_rotations_are_searched_from_coarse_to_fine(
     best = placing.candidates[0]
     score, rotation, row, col = best.best()
     assert score >= placing.score_map.max() - 1e-4
-    # Its score is that of its bin.
+    # The best candidate's score is the exact score of its bin and pixel.
     kernels = encode(image, pixel, [rotation * math.tau / 180])
     volume = cross_correlation(networks.encode_scene(image), kernels)
     assert volume[0, row, col] == pytest.approx(score, rel=1e-4)
@@ -241,7 +241,7 @@ def test_drawn_bins_represent_all_bins():
     drawn = draw_bins({0}, 180, step, np.random.default_rng(0))
     near = [min(bin_, 180 - bin_) <= 5 for bin_ in drawn if bin_]
     assert near == [True, True, False, False]
-    # A final observation has no labels.
+    # For a final observation, which has no labels, bins are drawn too.
     drawn = draw_bins(set(), 90, step, np.random.default_rng(0))
     assert sum(math.exp(weight) for weight in drawn.values()) == pytest.approx(90)
 
@@ -249,12 +249,12 @@ def test_drawn_bins_represent_all_bins():
 @pytest.mark.parametrize(
     ("labels", "rotations", "near", "far"),
     [
-        # At N = 36 only one bin on either side is near a label; the others are far.
+        # With 36 bins, only the bins next to a label are near; all others are far.
         ({3, 4}, 9, 2, 5),
         ({3, 4}, 18, 2, 14),
         ({3, 4}, 36, 2, 32),
         ({3, 4}, 99, 2, 32),
-        # Never fewer than the default.
+        # If fewer bins than the default are requested, the default number is drawn.
         ({3, 4}, 1, 2, 2),
         ({3}, 9, 2, 6),
         (set(), 9, 0, 9),

@@ -53,7 +53,7 @@ def test_other_rotations_are_nearly_exact(samples: int):
                 relative_error(network(rotate_image(image, degrees)), rotate_image(output, degrees))
                 for degrees in (15, 30, 45)
             ]
-    # The remaining error is the aliasing of four poolings.
+    # The remaining error comes from the aliasing of four poolings.
     assert np.median(errors) < 0.2
     assert np.max(errors) < 0.3
 

@@ -45,7 +45,7 @@ CARD = {"scenario": "mine", "demonstration_seeds": [10_000, 10_001], "steps": 7}
 
 @functools.cache
 def trained(config: NetworkConfig) -> Networks:
-    """Networks in which no weight, and no bias, has its initial value."""
+    """Networks whose weights and biases all differ from their initial values."""
     torch.manual_seed(0)
     networks = make_networks(config)
     with torch.no_grad():
@@ -68,7 +68,7 @@ def file(tmp_path: Path) -> Path:
 
 
 def maps(networks: Networks, image: NDArray[np.float32]) -> dict[str, Tensor]:
-    """All predictions of the networks."""
+    """All predictions of the networks for an image, by name."""
     pixel = (20, 70)
     picking = networks.predict_pick(image, 36)
     angles = picking.angle(pixel)
@@ -101,13 +101,13 @@ def test_loaded_networks_predict_the_same_as_trained_ones(config: NetworkConfig,
     assert_close(maps(loaded, image), maps(trained(config), image), 1e-5)
 
 
-# At N = 180 a fit to every element of a kernel would be too large.
+# At N = 180, a least-squares fit to all elements of a kernel would need too much memory.
 @pytest.mark.parametrize(
     ("method", "orientations"),
     [*((method, 72) for method in METHODS), ("equivariant_transporter", 180)],
 )
 def test_training_continues_from_a_file(method: str, orientations: int, tmp_path: Path):
-    """The weights are recovered from the expanded kernels."""
+    """The file holds expanded kernels, from which the weights are recovered."""
     networks = trained(dataclasses.replace(TINY, method=method, orientations=orientations))
     save_weights(tmp_path / "first.safetensors", networks, {})
     again = load_trainable(tmp_path / "first.safetensors")
@@ -164,7 +164,7 @@ def test_a_file_is_much_smaller_than_the_plain_kernels(tmp_path: Path):
 
 
 def test_older_files_are_read(file: Path):
-    """Their config has older names for some fields and lacks others."""
+    """In an older file, the config has other names for some fields and lacks one."""
     tensors, metadata = content(file)
     config = json.loads(metadata["config"])
     for old, new in (("colour_deviation", "colour_std"), ("height_deviation", "height_std")):
@@ -229,7 +229,7 @@ def content(path: Path) -> tuple[Tensors, Metadata]:
 
 
 def refusal(path: Path) -> str:
-    """The one-sentence error for an unusable file."""
+    """Loads an unusable file; returns the error's message, which is short and names the file."""
     with pytest.raises(UserError) as caught:
         load_networks(path)
     message = str(caught.value)
@@ -276,7 +276,7 @@ def test_weights_of_another_program_are_rejected(file: Path, metadata: Metadata 
 
 
 def reconfigured(**fields: Any) -> Callable[[Tensors, Metadata], None]:
-    """Corrupts fields of a file's config; None removes a field."""
+    """Returns a function that changes fields of a file's config; None removes a field."""
 
     def spoil(_: Tensors, metadata: Metadata) -> None:
         config = json.loads(metadata["config"]) | fields
@@ -287,7 +287,7 @@ def reconfigured(**fields: Any) -> Callable[[Tensors, Metadata], None]:
 
 
 def described(**entries: str) -> Callable[[Tensors, Metadata], None]:
-    """Corrupts a file's metadata."""
+    """Returns a function that changes entries of a file's metadata."""
     return lambda _, metadata: metadata.update(entries)
 
 
@@ -365,7 +365,7 @@ SPOILT = {
 
 @pytest.fixture(scope="module")
 def both_kinds(tmp_path_factory: pytest.TempPathFactory) -> tuple[Tensors, Metadata]:
-    """The content of a file with both plain and steerable layers."""
+    """The tensors and metadata of a file with both plain and steerable layers."""
     path = tmp_path_factory.mktemp("weights") / "policy.safetensors"
     save_weights(path, trained(TINY), CARD)
     return content(path)

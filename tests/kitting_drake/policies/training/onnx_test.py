@@ -35,7 +35,7 @@ def generalist() -> Networks:
 
 
 def prepared(image: np.ndarray, config: dict) -> np.ndarray:
-    """(1, channels, rows, cols): an input of the graphs, as described in docs/learning.md."""
+    """The input of a graph (1, channels, rows, cols), made as docs/learning.md describes."""
     channels, stride = config["channels"], config["stride"]
     ends = [(0, (1 - side) % stride) for side in image.shape[1:]]
     seen = np.pad(image[-channels:], [(0, 0), *ends])
@@ -60,7 +60,7 @@ def test_the_graphs_agree_with_torch(exported: Path, generalist: Networks, name:
     with torch.inference_mode():
         expected = getattr(networks, name)(torch.from_numpy(given)).numpy()
     (found,) = session.run(["output"], {"image": given})
-    # float32 rounding differs between processors, about 1e-5 for logits of up to forty.
+    # Rounding in float32 differs between processors: by about 1e-5 for logits of up to 40.
     assert np.abs(found - expected).max() < 5e-5 * max(10.0, np.abs(expected).max())
 
 

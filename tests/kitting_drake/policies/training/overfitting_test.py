@@ -1,4 +1,4 @@
-"""Overfits a few scenes, and tests copies of them rendered at other rotations."""
+"""Overfits networks to a few scenes, and tests them on the same scenes at other rotations."""
 
 import math
 
@@ -25,14 +25,14 @@ from tests.kitting_drake.policies.scenes import (
 
 SCENES = range(4)
 ROTATIONS = (10, 20, 33, 45, 57, 70, 110, 155)
-"""In degrees; each puts the labels between pixels."""
+"""Rotations in degrees, each of which moves the labels between pixels."""
 GRID = PixelGrid(rows=SIDE, cols=SIDE)
 
 
 def prediction_errors(
     networks: Networks, sample: LabelledImage, *, continuous: bool = False
 ) -> list[float]:
-    """Errors of the pick in pixels and bins, then those of the place."""
+    """The pick's errors in pixels and bins, then the place's errors in pixels and bins."""
     policy = LearnedPolicy(
         networks, orientations=ORIENTATIONS, stages=DEFAULT_STAGES if continuous else ()
     )
@@ -56,7 +56,7 @@ def log_odds(networks: Networks, image: NDArray[np.float32]) -> float:
 
 
 def shifted(sample: LabelledImage, random: np.random.Generator, **_: bool) -> LabelledImage:
-    """Replaces the augmentation: training sees no rotated scene."""
+    """Replaces the augmentation by random shifts, so that training sees no rotated scene."""
     return move(sample, 0.0, random.integers(-ROOM, ROOM + 1, size=2).astype(float))
 
 
@@ -79,7 +79,7 @@ def test_memorises_scenes_and_generalises_by_equivariance(
     networks.eval()
 
     def errors(*rotations: float, continuous: bool = False) -> NDArray[np.float64]:
-        """(rotations, scenes, 4)."""
+        """The prediction errors (rotations, scenes, 4)."""
         return np.array(
             [
                 [
@@ -101,7 +101,7 @@ def test_memorises_scenes_and_generalises_by_equivariance(
         print(f"  {name:9}{found.max(0).round(2)}")
     print(f"  others   {rotated.max((0, 1)).round(2)}, {right.sum()} of {right.size} within one")
     print(f"  log-odds at least {min(present):.1f} with a tool, {max(absent):.1f} without at most")
-    # The baselines have not converged to the last pixel.
+    # The baselines may be off by a pixel or a bin, as they have not fully converged.
     assert seen.max() < (0.01 if method == "so2" else 1.001)
     assert min(present) > max(absent)
     if method == "so2":

@@ -53,7 +53,7 @@ def test_a_resumed_run_continues_exactly(decay: bool, stop: bool, monkeypatch: p
     assert found == expected
     assert after.step_count == 4
     assert_same(after, whole)
-    # Networks that can stop had a final observation in some steps.
+    # With a stop network, some of the steps had a final observation, and others had none.
     assert {"stop" in losses for losses in found} == ({True, False} if stop else {False})
 
 
@@ -121,7 +121,7 @@ def test_one_step_in_eight_has_a_final_observation():
     drawn = [learner._draw(step, samples, FINALS).final for step in range(240)]
     images = [image for image in drawn if image is not None]
     assert 18 < len(images) < 45
-    # Each has its own motion.
+    # Every final observation was moved differently.
     assert len({image.tobytes() for image in images}) == len(images)
 
 
@@ -165,7 +165,7 @@ def test_every_weight_is_trained_by_one_loss(method: str):
     Trainer(networks, seed=0).step([scene(0)])
     after = networks.state_dict()
     unmoved = {name for name in before if torch.equal(before[name], after[name])}
-    # A softmax does not depend on an offset of all logits: only rounding changes these biases.
+    # A softmax ignores an offset of all logits, so only rounding can change these biases.
     assert unmoved <= {"alpha.out.bias", "f_pick.out.third.bias", "f_pick.out.shortcut.bias"}
 
 
@@ -175,5 +175,5 @@ def test_the_learning_rate_warms_up_and_decays_to_zero():
     assert max(shares) == pytest.approx(1, rel=0.05)
     assert (np.diff(shares[100:]) < 0).all()
     assert shares[1000] == pytest.approx(0, abs=1e-8)
-    # It stays zero after the last step.
+    # After the last step the rate stays zero.
     assert decayed(1500, 1000) == pytest.approx(0, abs=1e-8)

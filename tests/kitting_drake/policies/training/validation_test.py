@@ -42,7 +42,7 @@ def predicted(
     rotation: float = 0.0,
     log_odds: float | None = None,
 ) -> Decision:
-    """The expert's action with the given errors; the place follows the actual pick."""
+    """The expert's action with given errors; those of the place are relative to the actual pick."""
     pick_pixel = PICK + pick
     place_pixel = PLACE + rotation_matrix(ROTATION) @ np.array(pick) + place
     action = make_action(SEEN, pick_pixel, THETA + theta, place_pixel, ROTATION + rotation)
@@ -55,17 +55,17 @@ def predicted(
     ("decision", "expected"),
     [
         (predicted(), (0, 0, 0, 0, 0)),
-        # Another grasp does not matter if the object is placed correctly.
+        # A grasp elsewhere on the object costs nothing if the object is placed correctly.
         (predicted(pick=(3, 4)), (10, 0, 0, 0, 0)),
         (predicted(place=(0.3, -0.4)), (0, 0, 1, 0, 1)),
         (predicted(theta=math.radians(2)), (0, 2, 0, 0, 50 * math.radians(2))),
         (predicted(theta=math.pi - math.radians(2)), (0, 2, 0, 0, 50 * math.radians(2))),
         (predicted(rotation=-math.radians(3)), (0, 0, 0, 3, 50 * math.radians(3))),
         (predicted(rotation=math.tau), (0, 0, 0, 0, 0)),
-        # The errors add up, but are clipped.
+        # The cost adds up the place's error and both angle errors, but is clipped at 20 mm.
         (predicted(place=(3, 4), theta=0.02, rotation=0.04), (0, 1.1459, 10, 2.2918, 13)),
         (predicted(rotation=math.pi), (0, 0, 0, 180, 20)),
-        # A pick that misses every object moves none.
+        # A pick that misses every object has the largest cost.
         (predicted(pick=(-9, 6)), (2 * math.hypot(9, 6), 0, 0, 0, 20)),
     ],
 )
@@ -118,9 +118,9 @@ def test_wrong_stop_decisions_are_counted_and_cost_as_if_lost():
 @pytest.mark.parametrize(
     ("present", "absent", "threshold"),
     [
-        # Where they separate, between them and nearer to the final observations.
+        # If the log-odds separate, the threshold is between, nearer to the final observations.
         ((3.0, 9.0, 5.0), (-1.0, -7.0), 0.0),
-        # Otherwise the fewest errors; among equals, the lower threshold.
+        # If not, it makes the fewest errors; of equally good thresholds it is the lower one.
         ((3.0, 5.0, 6.0, -2.0), (-1.0, -3.0, 0.0), 0.75),
         ((1.0,), (2.0,), 0.0),
         ((), (1.0,), None),

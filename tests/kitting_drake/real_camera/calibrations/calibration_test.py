@@ -95,7 +95,7 @@ def test_three_layouts_give_the_same_camera(tmp_path: Path):
         (one,), (two,) = own.cameras, other.cameras
         assert (two.name, two.intrinsics) == (one.name, one.intrinsics)
         np.testing.assert_allclose(two.X_BC, one.X_BC, atol=1e-12)
-    # The camera looks straight down; the image's right is the base's -y.
+    # The camera looks straight down; the image's x axis (to the right) points along the base's -y.
     np.testing.assert_allclose(own.cameras[0].X_BC[:3, :3] @ [0, 0, 1], [0, 0, -1], atol=1e-12)
     np.testing.assert_allclose(own.cameras[0].X_BC[:3, :3] @ [1, 0, 0], [0, -1, 0], atol=1e-12)
     assert own.table_height == 0.012
@@ -115,7 +115,7 @@ transform:
 
 
 def test_rays_invert_the_distortion(tmp_path: Path):
-    """Distorted by the formula in OpenCV's manual, a ray hits its pixel."""
+    """A pixel's ray, distorted by the formula in OpenCV's manual, hits that pixel again."""
     camera = read(tmp_path, OWN).cameras[0]
     x, y = camera.rays.u.astype(float), camera.rays.v.astype(float)
     k1, k2, p1, p2, k3 = camera.intrinsics.distortion
@@ -212,7 +212,7 @@ def test_a_transposed_camera_matrix_is_rejected(tmp_path: Path):
 
 
 def test_poses_may_be_nested_as_in_ros(tmp_path: Path):
-    """As in PoseWithCovarianceStamped."""
+    """ROS nests them in this way in PoseWithCovarianceStamped."""
     pose = "{position: {x: 0.5, y: 0.1, z: 0.9}, orientation: {x: 0.7071068, y: -0.7071068}}"
     pose = pose.replace("-0.7071068}", "-0.7071068, z: 0.0, w: 0.0}")
     wrapped = f"{{header: {{frame_id: base}}, pose: {{pose: {pose}, covariance: [0.0]}}}}"
@@ -223,7 +223,7 @@ def test_poses_may_be_nested_as_in_ros(tmp_path: Path):
 
 
 def test_misplaced_and_misspelt_fields_are_rejected(tmp_path: Path):
-    """With `camera_info`, a distortion beside it would be ignored."""
+    """They would be ignored otherwise, as a distortion beside `camera_info` would be."""
     text = ROS.replace("camera_info:", "distortion: []\n    camera_info:")
     with pytest.raises(UserError, match="camera eye has the unknown field 'distortion'"):
         read(tmp_path, text, eye_info=CAMERA_INFO)

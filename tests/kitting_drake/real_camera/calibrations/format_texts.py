@@ -1,4 +1,4 @@
-"""Calibrations of one camera in the layouts of other tools, as these write them.
+"""Calibrations of one camera, as other tools write them.
 
 All describe the same lens, and the same pose in the base: looking straight down from 0.9 m.
 """
@@ -61,7 +61,7 @@ OPEN3D_PARAMETERS = (
     '0.0, 51.0, 0.0, 31.5, 23.25, 1.0 ],\n\t\t"width" : 64\n\t},\n\t"version_major" : 1,\n'
     '\t"version_minor" : 0\n}'
 )
-# The file of Open3D's recorder for an Azure Kinect.
+# Written by Open3D's recorder for the Azure Kinect.
 OPEN3D_AZURE = (
     '{\n    "color_mode": "MJPG_720P", "depth_mode": "NFOV_UNBINNED", "height": 48,\n'
     '    "intrinsic_matrix": [50.0, 0, 0, 0, 51.0, 0, 31.5, 23.25, 1],\n'
@@ -225,7 +225,7 @@ ROS1_ARGUMENTS = (
     "rosrun tf static_transform_publisher 0.5 0.1 0.9 -1.57079632679 0 3.14159265359 base_link "
     "camera_color_optical_frame 100 __name:=eye\n"
 )
-# The inverse: where the base is for the camera.
+# The inverse transform: the pose of the base in the camera's frame.
 INVERSE_STAMPED = """header:
   stamp: {sec: 0, nanosec: 0}
   frame_id: front_color_optical_frame

@@ -1,4 +1,4 @@
-"""Calibrations that other tools write."""
+"""Reading calibrations that other tools wrote."""
 
 from pathlib import Path
 
@@ -23,7 +23,7 @@ BROWN = (0.1, -0.05, 0.001, -0.002)
 
 
 def read(folder: Path, entry: str, **files: str) -> BenchCamera:
-    """The camera front, with an entry of some lines and files beside the calibration."""
+    """Reads a camera from its entry in a calibration file, beside which other files are written."""
     for name, content in files.items():
         (folder / name.replace("__", ".")).write_text(content)
     path = folder / "calibration.yaml"
@@ -158,7 +158,7 @@ def test_a_body_is_not_an_optical_frame(tmp_path: Path):
         read(tmp_path, f"{texts.LENS}    pose: eye", eye=body)
     optical = "{position: [0, 0.015, 0], quaternion_xyzw: [-0.5, 0.5, -0.5, 0.5]}"
     camera = read(tmp_path, f"{texts.LENS}    pose: eye\n    optical_to_link: {optical}", eye=body)
-    # The body's x points forward, which is the optical frame's z.
+    # The x axis of the body's frame points forward, like the z axis of the optical frame.
     same(camera.X_BC[:3, 2], X_BC[:3, 0])
     same(camera.X_BC[:3, 3], X_BC[:3, 3] + 0.015 * X_BC[:3, 1])
 
@@ -172,7 +172,7 @@ def test_kalibr_chains_give_poses(tmp_path: Path):
     )
     left, right = read_calibration(tmp_path / "c.yaml").cameras
     assert (left.intrinsics.model, right.intrinsics.model) == ("", "equidistant")
-    # A point of the base, seen by both, obeys T_cn_cnm1.
+    # A point's coordinates in the two cameras differ as the file's T_cn_cnm1 says.
     point = np.array([0.4, 0.2, 0.0, 1])
     seen = np.linalg.inv(left.X_BC) @ point
     same(np.linalg.inv(right.X_BC) @ point, seen + [-0.11, 0.02, 0, 0])
@@ -194,7 +194,7 @@ def test_realsense_text_needs_a_resolution(tmp_path: Path):
     assert depth.focal == (39, 39)
     large = read(tmp_path, f"camera_info: rs\n    resolution: [128, 96]\n    {pose}")
     assert large.intrinsics.model == "inverse_brown_conrady"
-    # Librealsense's rs2_deproject_pixel_to_point applies the polynomial to the pixel.
+    # As in librealsense's rs2_deproject_pixel_to_point, the polynomial is applied to the pixel.
     x, y = (10 - 63.5) / 100, (20 - 47) / 102
     k1, k2, p1, p2, k3 = large.intrinsics.distortion
     r2 = x * x + y * y

@@ -1,4 +1,4 @@
-"""The part of the workspace that is table: read, written, and used by o_t and by the checks."""
+"""The table's outline: it is read, written, and used by o_t and by the checks."""
 
 import dataclasses
 from pathlib import Path
@@ -63,7 +63,7 @@ def test_an_outline_survives_writing(tmp_path: Path):
         for item in (TRUE, found, again, read(tmp_path, region=LEFT, ignore=[BASE]))
     ]
     assert digests[1] == digests[2] and len(set(digests)) == 3
-    # Without an outline, records are as they were before there were outlines.
+    # Without an outline, a record has no fields for it.
     assert set(calibration_record(TRUE)) == {"table_height", "workspace", "cameras"}
 
 
@@ -95,7 +95,7 @@ def test_invalid_outlines_are_refused(tmp_path: Path, fields: dict[str, object],
 
 
 def beside_a_drop() -> tuple[dict[str, Frame], Calibration]:
-    """The table ends at y = 0.1; beyond it one camera sees a step 60 mm higher."""
+    """A camera's frame of a table that ends at y = 0.1, where a surface 60 mm higher begins."""
     front = Calibration(TRUE.cameras[:1], TRUE.grid)
     low = cast(front)["front"]
     grid = dataclasses.replace(TRUE.grid, z_min=0.06)

@@ -1,4 +1,4 @@
-"""The check finds known camera errors by looking at the table."""
+"""The check of cameras finds known errors in frames of an empty table, or of a block on it."""
 
 import dataclasses
 import functools
@@ -38,7 +38,7 @@ MILD = SensorNoiseParameters(depth_std=0.001, depth_step=0.0005, flying_share=0.
 
 
 def slow(value: Any) -> Any:
-    """A parameter value for `make test-slow` only."""
+    """A parameter value that is tested by `make test-slow` only."""
     return pytest.param(value, marks=pytest.mark.slow)
 
 
@@ -49,14 +49,14 @@ def table(rendering: None) -> dict[str, Frame]:
 
 @functools.cache
 def frames_of_block() -> dict[str, Frame]:
-    """The block as the cameras see it; nobody writes into the frames."""
+    """Frames of the block, which are shared by tests and must not be changed."""
     return cast(TRUE, BLOCK)
 
 
 def noisy(
     frames: dict[str, Frame], longer: float = 0.0, *, noise=MODERATE, takes: int = 1
 ) -> dict[str, Frame]:
-    """Frames with noise and a depth error; each depth is the median of several takes."""
+    """Frames with noise, whose depths are `longer` (m) and the median of some takes."""
     random = np.random.default_rng(0)
     result = {}
     for name, frame in frames.items():
@@ -69,7 +69,7 @@ def noisy(
 
 
 def moved(name: str, *, shift=(0.0, 0.0, 0.0), rotvec_deg=(0.0, 0.0, 0.0)) -> Calibration:
-    """A calibration with a wrong pose for one camera."""
+    """A calibration in which the pose of one camera is wrong by this shift and rotation."""
     X = next(camera.X_BC for camera in TRUE.cameras if camera.name == name).copy()
     X[:3, :3] = Rotation.from_rotvec(rotvec_deg, degrees=True).as_matrix() @ X[:3, :3]
     X[:3, 3] += shift
@@ -91,7 +91,7 @@ def test_finds_a_depth_bias(table: dict[str, Frame], longer: float):
     for camera in check.cameras.values():
         assert camera.depth_bias == pytest.approx(longer, rel=0.2)
         assert explains_depth(camera)
-        # Longer depths make the table look lower.
+        # If depths are too long, the table looks lower.
         assert camera.table.bias * longer < 0
 
 
@@ -105,7 +105,7 @@ def test_finds_a_tilt_and_its_axis(table: dict[str, Frame], axis: tuple[float, f
 
 def test_finds_a_camera_that_is_too_high(table: dict[str, Frame]):
     check = check_cameras(noisy(table), moved("front", shift=(0, 0, 0.003)))
-    # The hand stops 1.5 mm above the assumed table.
+    # The default clearance is 1.5 mm, and the table seems 3 mm too high.
     assert "may go 1.5 mm into the table" in _meaning(check, "height bias")
     lines = findings(check, PickPlaceParameters(floor_clearance=0.0025))
     assert any("may go 0.5 mm into the table" in line.meaning for line in lines)
@@ -115,7 +115,7 @@ def test_finds_a_camera_that_is_too_high(table: dict[str, Frame]):
     assert abs(check.cameras["left"].table.bias) < 0.0003
     assert check.disagreements["front", "left"] == pytest.approx(0.003, rel=0.2)
     assert abs(check.disagreements["left", "right"]) < 0.0003
-    # The measured noise is that of the input.
+    # The measured noise is that of `noisy`.
     assert check.cameras["front"].table.noise == pytest.approx(0.0016, rel=0.5)
 
 
@@ -149,7 +149,7 @@ def test_a_square_block_is_never_off_by_a_quarter_turn(yaw: float):
 
 @pytest.mark.parametrize("pose", [slow((0.45, -0.2, 1.1)), slow((0.6, 0.2, 0.3))])
 def test_distortion_does_not_displace_the_block(pose: tuple[float, float, float]):
-    """A pixel near the image's border covers a larger area than one at the centre."""
+    """With distortion, pixels near the image's border cover more of the table than central ones."""
     block = Block((0.20, 0.15, 0.05), pose)
     cameras = (
         dataclasses.replace(
@@ -195,7 +195,7 @@ def test_a_rotation_about_the_block_is_reported_as_an_offset():
     frames = {"front": frames_of_block()["front"]}
     check = check_cameras(frames, with_poses(ONE, {"front": X}), BLOCK)
     assert np.hypot(*offset(check.cameras["front"].block, BLOCK)[:2]) < 5e-4
-    # 2.6 mm at 10 cm from the block.
+    # The block is seen in place, but points 10 cm from it are off by 2.6 mm.
     assert _line(check, "offset").verdict == BAD
 
 
@@ -220,7 +220,7 @@ def _meaning(check: Check, what: str) -> str:
 
 
 def test_corrected_poses_are_the_true_ones():
-    """Rotations and shifts are both corrected if the block's pose is known."""
+    """If the block's pose is known, both rotations and shifts of cameras are corrected."""
     believed = with_poses(
         moved("left", shift=(0.002, -0.001, 0.003), rotvec_deg=(0.3, 0.1, -0.2)),
         {"right": moved("right", rotvec_deg=(-0.2, 0.2, 0)).cameras[2].X_BC},

@@ -1,4 +1,4 @@
-"""Decisions refuse frames of a table that is not where the calibration says."""
+"""`check_table` refuses frames whose table is not where the calibration says."""
 
 import dataclasses
 from collections.abc import Callable
@@ -27,7 +27,7 @@ BLOCK = Block((0.28, 0.26, 0.05), (0.45, -0.1, 0.4))
 
 @pytest.fixture(scope="module")
 def frames() -> Frames:
-    """A kit on a table, with 1 mm of noise."""
+    """A camera's frame of a kit on a table, with 1 mm of noise."""
     [(name, frame)] = cast(SLANTED, BLOCK).items()
     noise = 0.001 * np.random.default_rng(0).standard_normal(frame.depth.shape)
     return {name: Frame(frame.color, (frame.depth + noise).astype(np.float32))}
@@ -124,13 +124,13 @@ def test_doubts_are_warnings(frames: Frames):
 
 
 def test_large_objects_before_the_table_are_no_reason():
-    """A near camera sees mostly the tops of boxes."""
+    """A large block hides much of the table, but the calibration is right."""
     frames = cast(SLANTED, Block((0.45, 0.8, 0.12), (0.5, 0.0, 0.0)))
     assert check_table(frames, dataclasses.replace(SLANTED, verified=True)) == []
 
 
 def test_a_lower_and_larger_plane_is_the_table():
-    """The top of a large block lies at the assumed height of the table."""
+    """The calibration's table is at the height of a block's top; the real table is below."""
     frames = cast(SLANTED, BLOCK)
     with pytest.raises(CalibrationError, match="50 mm lower"):
         check_table(frames, raised(0.05))

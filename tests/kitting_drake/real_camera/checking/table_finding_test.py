@@ -1,4 +1,4 @@
-"""The table, the workspace and the region are found in one frame."""
+"""The table, its outline and the workspace are found in one frame."""
 
 import math
 import sys
@@ -22,19 +22,20 @@ from systems.signals import PixelGrid
 FLOOR = -0.7
 TABLE = 0.05
 Box = tuple[tuple[float, float], tuple[float, float], float]
-"""x from and to, y from and to, and the top, in metres."""
+"""A box: its range in x, its range in y, and the height of its top, in metres."""
 TOP: Box = ((0.30, 0.70), (-0.30, 0.35), TABLE)
 KIT: Box = ((0.45, 0.67), (0.05, 0.30), TABLE + 0.04)
 POST: Box = ((0.32, 0.40), (-0.05, 0.05), TABLE + 0.25)
 EDGE: Box = ((0.30, 0.70), (-0.33, -0.30), TABLE + 0.03)
-"""A profile along the table's edge."""
+"""A profile along the table's edge, 30 mm higher than the table."""
 
 
 def camera(degrees: float = 35.0) -> Calibration:
-    """A camera 1.1 m above the floor's table, aslant."""
+    """A camera 1.1 m from the table, at which it looks from `degrees` off the vertical."""
     angle = math.radians(degrees)
     X = np.eye(4)
-    # x right in the image is base y; the camera looks back towards the robot.
+    # The image's x axis (to the right) points along the base's +y; the camera looks back towards
+    # the robot.
     forward = np.array([-math.sin(angle), 0, -math.cos(angle)])
     X[:3, :3] = np.column_stack([[0, 1, 0], np.cross(forward, [0, 1, 0]), forward])
     X[:3, 3] = np.array([0.5, 0.0, TABLE]) - 1.1 * forward
@@ -43,7 +44,7 @@ def camera(degrees: float = 35.0) -> Calibration:
 
 
 def look(calibration: Calibration, boxes: list[Box], noise: float = 0.001) -> dict[str, Frame]:
-    """What the camera sees of boxes that stand on the floor."""
+    """Frames of boxes that stand on the floor, seen by the calibration's camera."""
     (eye,) = calibration.cameras
     u, v = np.broadcast_arrays(eye.rays.u, eye.rays.v)
     rays = np.stack([u, v, np.ones_like(u)], axis=-1).astype(float) @ eye.X_BC[:3, :3].T
@@ -72,7 +73,8 @@ def test_a_table_above_the_floor_is_found():
     assert grid.cols * grid.resolution == pytest.approx(0.65, abs=0.06)
     region = calibration.outline.region
     assert 4 <= len(region) <= 12
-    # The kit stands on it; the floor, the profile and what is beside the table are no table.
+    # The first three points are on the table, some of them below the kit. The others are on the
+    # profile or beside the table.
     xy = [[0.5, 0.2], [0.65, 0.28], [0.35, -0.25], [0.5, -0.32], [0.5, 0.37], [0.28, 0.0]]
     assert calibration.contains(np.array(xy)).tolist() == [True] * 3 + [False] * 3
     x, y = np.array(region).T
@@ -113,7 +115,7 @@ def test_a_tilted_table_is_told_and_a_wall_is_none(tmp_path: Path):
 
 @pytest.fixture
 def told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> str:
-    """What `--find` prints of a tilted table."""
+    """What `--find` prints about a table that is tilted in the calibration."""
     eye = camera()
     frame = look(eye, [TOP, KIT])["eye"]
     np.save(tmp_path / "depth.npy", frame.depth)

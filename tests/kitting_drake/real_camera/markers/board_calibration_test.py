@@ -1,4 +1,4 @@
-"""Cameras are calibrated by rendered boards of markers."""
+"""Cameras are calibrated from rendered images of boards of markers."""
 
 import json
 import math
@@ -33,7 +33,7 @@ LENS = "width: 640, height: 480, fx: 600, fy: 602, cx: 318, cy: 242"
 BROWN = (0.08, -0.15, 0.001, -0.0005, 0.02)
 FISHEYE = (-0.02, 0.01, 0.0, 0.0)
 SCALE = 3000.0
-"""Pixels of the printed board to a metre."""
+"""The resolution of the printed board, in pixels per metre."""
 
 
 def described(folder: Path, text: str) -> Board:
@@ -48,7 +48,10 @@ def lenses(folder: Path, *names: str, more: str = "") -> Path:
 
 
 def above(board: Board, tilt: float, distance: float = 0.7, roll: float = 20) -> NDArray:
-    """(4, 4): a camera that looks at the board's middle, so many degrees from its normal."""
+    """The pose X_MK (4, 4) of a camera that looks at the board's middle.
+
+    The line of sight is `tilt` degrees from the board's normal.
+    """
     x, y = board.size
     X_MK = np.eye(4)
     X_MK[:3, :3] = (
@@ -62,7 +65,7 @@ def above(board: Board, tilt: float, distance: float = 0.7, roll: float = 20) ->
 def render(
     board: Board, X_MK: NDArray, model: str = "", values: tuple[float, ...] = ()
 ) -> NDArray[np.uint8]:
-    """(480, 640, 3): the image of a board on a grey table, with noise of 2 steps."""
+    """The image (480, 640, 3) of a board on a grey table, with a noise of 2 grey levels."""
     fine = 2
     pixels = tuple(round(SCALE * side) for side in board.size)
     printed = board.pattern.generateImage(pixels, marginSize=0)
@@ -105,7 +108,7 @@ def save(folder: Path, image: NDArray[np.uint8], name: str = "color.png") -> Pat
 
 
 def errors(found: NDArray, expected: NDArray) -> tuple[float, float]:
-    """In mm and degrees."""
+    """The position error in mm and the rotation error in degrees of a found pose."""
     turned = Rotation.from_matrix(found[:3, :3].T @ expected[:3, :3]).magnitude()
     return 1e3 * float(np.linalg.norm(found[:3, 3] - expected[:3, 3])), math.degrees(turned)
 
@@ -198,7 +201,7 @@ def two_cameras(folder: Path) -> tuple[Board, list[NDArray], Path]:
 
 
 def test_the_command(tmp_path: Path, verb: Callable):
-    """Two cameras and two frames give one calibration, a report and pictures."""
+    """Two frames of two cameras each give one calibration, a report and pictures."""
     board, X_MK, path = two_cameras(tmp_path)
     out, frames = tmp_path / "out", (tmp_path / "frame1", tmp_path / "frame2")
     given = ("--calibrate", tmp_path / "board.yaml", "--camera", path, "--output", out)
@@ -258,7 +261,7 @@ def test_images_that_tell_nothing_are_refused(tmp_path: Path):
 
 
 def test_a_small_far_tag_is_ambiguous():
-    """Its perspective is lost in the noise of the corners."""
+    """The tag's perspective is lost in the noise of its corners, so two poses fit."""
     points = 0.05 * np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
     X_KM = np.linalg.inv(above_tag(20))
     lens = Intrinsics(SIZE, FOCAL, CENTRE)

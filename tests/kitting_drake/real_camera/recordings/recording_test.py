@@ -39,7 +39,7 @@ Sent = tuple[str, float, Any]
 
 
 class Ros:
-    """Makes and writes messages of ROS 1 or 2."""
+    """Makes messages of ROS 1 or ROS 2 and writes recordings of them."""
 
     def __init__(self, version: int) -> None:
         from rosbags import typesys
@@ -60,7 +60,7 @@ class Ros:
     def image(
         self, array: NDArray[Any], encoding: str, time: float, frame: str = OPTICAL, pad: int = 0
     ) -> Any:
-        """With some bytes after each row."""
+        """An image message with `pad` additional bytes after each row."""
         rows = np.ascontiguousarray(array).view(np.uint8).reshape(array.shape[0], -1)
         rows = np.pad(rows, ((0, 0), (0, pad)))
         return self.make(
@@ -126,7 +126,7 @@ class Ros:
 
 
 def session(ros: Ros) -> list[Sent]:
-    """Colour before depth, without depth at first; both change after half a second."""
+    """The messages of a recording: colour starts before depth, and both change after 0.5 s."""
     return [
         (INFO_TOPIC, 1.0, ros.info()),
         (COLOR_TOPIC, 1.0, ros.image(0 * COLOR, "rgb8", 1.0)),
@@ -243,7 +243,7 @@ def test_realsense_recordings_need_the_lens_of_colour(tmp_path: Path):
 
 
 def swapped(ros: Ros, **changes: Sent) -> list[Sent]:
-    """A session with other messages at some topics."""
+    """A session in which the given messages replace all messages of their topics."""
     new = {sent[0]: sent for sent in changes.values()}
     return [new.get(sent[0], sent) for sent in session(ros)]
 

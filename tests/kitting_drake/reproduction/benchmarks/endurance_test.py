@@ -1,4 +1,4 @@
-"""`benchmark endurance`: what counts, resuming, and the end of the shift."""
+"""`benchmark endurance`: what it counts, how it resumes, and when the shift ends."""
 
 import json
 from pathlib import Path
@@ -123,7 +123,7 @@ def test_a_shift_resumes_and_ends_when_its_hours_are_over(tmp_path: Path, monkey
     assert [scene.seed for scene in run(60 / 3600)] == ran == [7, 8]
     scenes = run(100 / 3600)
     assert [scene.seed for scene in scenes] == ran == [7, 8, 9, 10]
-    # A shorter shift counts only its own scenes.
+    # In the same folder, a shorter shift counts only the scenes that it needs.
     assert [scene.seed for scene in run(60 / 3600)] == [7, 8]
     measured = summarise_shift(scenes, CHOSEN, 10.0)
     assert measured["units"] == 11 and measured["hours"] == pytest.approx(120 / 3600)

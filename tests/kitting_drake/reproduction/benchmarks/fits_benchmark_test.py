@@ -1,4 +1,4 @@
-"""`benchmark fits`: its conditions, its summary, and that it resumes."""
+"""`benchmark fits`: its conditions, its summary, and how it resumes."""
 
 import io
 import json
@@ -21,7 +21,7 @@ from kitting_drake.reproduction.benchmarks.fits_figure import draw_fits
 
 
 def episode(seed: int, kitted: int) -> dict:
-    """The result of an episode with two tools; those that fail are blocked."""
+    """The result of an episode with two tools, of which `kitted` succeed; others are blocked."""
     objects = [
         {
             "name": f"tool_{number}",

@@ -1,4 +1,4 @@
-"""The verdict on a pick and place in a drawn scene."""
+"""The verdict on a pick and place in a random static scene."""
 
 from types import SimpleNamespace
 

@@ -13,6 +13,6 @@ def test_the_command(verb: Callable[..., subprocess.CompletedProcess[str]], tmp_
     assert "clearance, mm" in done.stdout
     measured = json.loads((tmp_path / "kits.json").read_text())
     assert measured["kits"] == 2
-    # The template's clearance is 2 mm.
+    # The kits' nominal clearance is 2 mm.
     assert 1.8 < measured["clearance_mm"]["minimum"] < measured["clearance_mm"]["median"] < 2.3
     assert measured["build_s"]["max"] > 0

@@ -21,7 +21,7 @@ def test_maps_the_reach_and_finds_a_better_base():
     measured = measure_reach(given, grid, Console(quiet=True))
     assert json.loads(json.dumps(measured)) == measured
     assert 0.1 < measured["share"] < 0.8
-    # The near part is reached, the far one is not.
+    # The workspace's near edge is reached, its far edge is not.
     lowest = measured["shares"][0]
     middle = len(measured["y"]) // 2
     assert lowest[0][middle] == 1.0
@@ -29,7 +29,7 @@ def test_maps_the_reach_and_finds_a_better_base():
     assert measured["best_share"] == pytest.approx(1.0)
     x, y, z = measured["best_base"]["base"]
     assert z == 0.0
-    # Beside the workspace.
+    # The best base is outside the workspace.
     assert max(0.4 - x, x - 0.65, -0.15 - y, y - 0.15) > 0.0
     size = Image.open(io.BytesIO(draw_reach(measured))).size
     assert size > (1000, 500)

@@ -1,4 +1,4 @@
-"""The table and diagram of `benchmark reliability`, from decisions that were drawn."""
+"""The table and diagram of `benchmark reliability`, made from random decisions."""
 
 import io
 import json
@@ -23,7 +23,10 @@ from kitting_drake.reproduction.benchmarks.reliability_report import (
 
 
 def drawn(policy: str, seed: int) -> list[Judged]:
-    """Decisions of scenes with three, one and default cameras; the better the fit, the safer."""
+    """Random decisions, which are the more often right the better the fit.
+
+    In turn, their scenes have three random cameras, one, or the default ones.
+    """
     random = np.random.default_rng(seed)
     names = read_reliability(policy).weights
     found = []
@@ -50,9 +53,9 @@ def test_a_fit_is_cross_validated_and_reported(tmp_path: Path):
         found = measured[policy]
         assert found["all"]["decisions"] == 300 and found["one random camera"]["decisions"] == 100
         assert found["all"]["calibration_error"] < 0.1
-        # The confidence of each decision above the threshold is at least 0.9.
+        # The policy acts at a confidence of 0.9 or more, so under a tenth of its answers are wrong.
         assert found["all"]["wrong_answers"] < 0.1
-    # The fitted file serves the weights that it lies beside.
+    # Weights use the confidence file that has their name and is beside them.
     (tmp_path / "confidence.json").rename(tmp_path / "own.confidence.json")
     own = read_reliability("networks", tmp_path / "own.safetensors")
     assert own.threshold == measured["networks"]["threshold"] == LEAST_CONFIDENCE

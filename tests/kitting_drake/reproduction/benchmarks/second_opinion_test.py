@@ -1,4 +1,4 @@
-"""MuJoCo is asked about the right tool at the right pose."""
+"""The second opinion by MuJoCo is about the right tool at the right pose."""
 
 from types import SimpleNamespace
 

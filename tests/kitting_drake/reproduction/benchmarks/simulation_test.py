@@ -20,7 +20,7 @@ def test_phases_sum_to_their_episodes():
         result = rig.run(stopwatch.observe)
         simulated += result.sim_seconds
         wall += result.wall_seconds
-    # The episode ends within a phase, which also counts.
+    # The phases add up to the episode, including the last one, during which it ends.
     assert list(stopwatch.phases)[:2] == ["observe", "approach"]
     assert sum(phase[0] for phase in stopwatch.phases.values()) == pytest.approx(simulated)
     assert sum(phase[1] for phase in stopwatch.phases.values()) == pytest.approx(wall, rel=0.5)
@@ -29,7 +29,7 @@ def test_phases_sum_to_their_episodes():
 
 @pytest.mark.parametrize("path", [simulation._SCENARIO, simulation._LEARNED])
 def test_the_measured_scenarios_find_their_files(path: Path):
-    """Weights and tools are sought beside the scenario's file."""
+    """Paths of weights and tools are relative to the scenario's file."""
     policy = load_scenario(path).policy
     assert policy.digest(path.parent) is None or policy.details(path.parent)
 

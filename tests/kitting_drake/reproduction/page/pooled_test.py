@@ -1,4 +1,4 @@
-"""The section on the shipped policies pools all suitable runs."""
+"""The section on the shipped policies pools all runs of their weights and settings."""
 
 from typing import Any
 
@@ -17,7 +17,7 @@ GENERALIST = shipped_policies()["generalist"].digest(SCENARIOS)
 def run(
     ends: list[int], seeds: range, recover: str = "false", limit: float = 180.0, **fields: Any
 ) -> Run:
-    """A run of the generalist with the same outcome in all episodes."""
+    """A run of the generalist whose episodes all end with the outcomes `ends` of their objects."""
     policy = f"!Learned {{weights: '', recover: {recover}}}"
     scenario = load_scenario(UNSEEN, text=f"{{policy: {policy}, time_limit: {limit}}}")
     objects = {str(index): end for index, end in enumerate(ends)}
@@ -37,7 +37,7 @@ def test_all_runs_of_the_shipped_weights_are_pooled():
     _, _, table = pooled_section([run([2, 2], range(9, 29)), run([2, 0], range(4))])
     row = [cell.strip() for cell in table.splitlines()[-1].strip("|").split("|")]
     assert row[:3] == ["generalist", "0 to 3, 9 to 28", "48"]
-    # 44 of 48 objects.
+    # The share is 44 of 48 objects.
     assert [cell.split(" ")[0] for cell in row[3:]] == ["91.7", "91.7"]
 
 

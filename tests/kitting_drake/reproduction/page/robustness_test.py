@@ -1,4 +1,4 @@
-"""The table of perturbations: each run goes into the row of its scenario."""
+"""The tables of robustness: each run goes into the row of its scenario's perturbation."""
 
 import copy
 import functools
@@ -17,7 +17,7 @@ UNSEEN = SCENARIOS / "paper/kitting_unseen.yaml"
 
 
 SAME = range(2870, 2895)
-"""The common seeds of the first table's cells."""
+"""The seeds that all cells of the first table have in common."""
 
 
 @functools.cache
@@ -54,7 +54,7 @@ def run(
 
 
 def rows(table: str) -> dict[str, list[str]]:
-    """The cells of each row by its label, from the last table."""
+    """The cells of each row, by the row's label; of rows with the same label, the last one."""
     lines = [line.strip("|").split("|") for line in table.splitlines() if "|" in line]
     return {line[0].strip(): [cell.strip() for cell in line[1:]] for line in lines}
 

@@ -24,7 +24,7 @@ FIRST: dict[str, Any] = {
     "resolved_scenario": {"task": {"_tag": "!Kitting"}},
 }
 SECOND: dict[str, Any] = {
-    # Text that looks like a number, JSON or nothing, and keys that look like columns.
+    # Some texts look like a number, JSON or nothing, and some keys look like columns of the table.
     "policy": 'a, "b"\nc',
     "details": {"steps": "3", "rate": "null", "weights": "", "of": {"a.b": 1}, "commit": "1e5"},
     "seeds": [9, 7],
@@ -100,6 +100,6 @@ def test_a_corrupt_table_is_an_error(folder: Path):
     (folder / TABLE).write_text("".join(line for line in lines if not line.startswith("first")))
     with pytest.raises(UserError, match=r"runs\.csv lacks the run 'first'"):
         read_summaries(folder)
-    # This is the state after an interruption between the two writes.
+    # An interrupted `add_run` can leave this state; repeating it writes the missing line.
     add_run(folder, "first", FIRST)
     assert (folder / TABLE).read_text() == content

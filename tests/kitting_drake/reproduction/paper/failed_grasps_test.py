@@ -1,4 +1,4 @@
-"""The number of actions that the memory of failed grasps can have changed, or its bounds."""
+"""How many actions of a run the memory of failed grasps can have changed: a number or a range."""
 
 from typing import Any
 
@@ -9,7 +9,7 @@ from kitting_drake.reproduction.paper.failed_grasps import changeable
 
 
 def summary(outcomes: list[list[int]], missed: int, dropped: int = 0, **fields: Any) -> dict:
-    """A summary of episodes, given by the outcomes of their objects."""
+    """The summary of a run, with the given outcomes of each episode's objects."""
     return {
         "resolved_scenario": {"task": {"_tag": "!ToolsetKitting"}},
         "policy_details": {},
@@ -28,7 +28,7 @@ def test_without_failed_grasps_nothing_changes():
 
 def test_a_failed_grasp_precedes_at_most_three_of_four_actions():
     assert changeable(summary([GOOD, GOOD, ONE_LOST], 1, actions=12)).text == "0 to 3 of 12"
-    # Of two failures in one episode, the second comes after the first.
+    # If an episode has two failures, at least one action comes after a failure: the second one.
     assert changeable(summary([[0, 0, 2, 2]], 1, 1, actions=4)).text == "1 to 3 of 4"
 
 
@@ -37,7 +37,7 @@ def test_placed_objects_took_their_own_actions():
     found = changeable(summary([[2] * 6, [2, 2, 2, 2, 2, 0]], 2, actions=14, **pyramid))
     assert found.text == "0 to 12 of 14"
     found = changeable(summary([[2] * 6, [2, 2, 2, 2, 2, 0]], 1, actions=14, **pyramid))
-    # Six of the fourteen actions placed the six cubes of the other episode.
+    # Six of the fourteen actions placed the cubes of the episode without a failure.
     assert found.text == "0 to 7 of 14"
     assert changeable(summary([[2] * 6], 1, **pyramid)).text == "0 to 11 of 12"
 

@@ -1,4 +1,4 @@
-"""The paper's part of the results and of the protocol, of summaries made for it."""
+"""The sections of docs/results.md and docs/protocol.md on the paper, made from synthetic runs."""
 
 import math
 from collections.abc import Iterable
@@ -30,7 +30,7 @@ CELLS = {cell.name: cell for cell in paper_cells()}
 
 
 def make_run(name: str, errors_mm: list[float]) -> Run:
-    """The run of a cell with equal episodes."""
+    """A run of a cell whose episodes all have these errors."""
     cell: Cell = CELLS[name]
     task = TASKS[cell.task]
     scenario = load_scenario(SCENARIOS / task.file, task.tested, cell.scenario_text("w"))
@@ -57,7 +57,7 @@ def make_run(name: str, errors_mm: list[float]) -> Run:
             "rigid": cell.policy.rigid,
         }
     summary |= {"resolved_scenario": described(scenario), "policy_details": details}
-    # The commit of this checkout may have uncommitted changes.
+    # The checkout that runs the test may have uncommitted changes, which would exclude the run.
     summary["commit"] = "0123456789"
     if isinstance(cell.policy, str):
         summary["policy_digest"] = scenario.policy.digest(SCENARIOS / "paper")
@@ -65,7 +65,7 @@ def make_run(name: str, errors_mm: list[float]) -> Run:
 
 
 def sections(runs: Iterable[Run], rates: Rates | None = None) -> str:
-    """Those of both pages."""
+    """The text of the sections of both pages."""
     divided = cell_results(list(runs), rates or {})
     results, again = divided.results, divided.to_run_again
     found = fresh_tools(results, again) + paper_sections(results, None, again)
@@ -85,7 +85,7 @@ def runs() -> tuple[Run, ...]:
 
 
 def rows(text: str) -> dict[tuple[str, ...], list[str]]:
-    """The rows of all tables, by their first two cells."""
+    """The cells of each row of all tables, by the row's first two cells."""
     lines = [line for line in text.splitlines() if line.startswith("| ")]
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
     return {tuple(row[:2]): row[2:] for row in cells}
@@ -122,7 +122,7 @@ def test_prose_about_a_cell_appears_with_the_cell(runs: tuple[Run, ...]):
     for words in told.values():
         assert words in everything
         assert words not in without
-    # No placeholder remains.
+    # All placeholders of the pages' templates were filled in.
     assert not set("{}$") & set(everything)
     assert "<!--" not in everything
 
@@ -134,7 +134,7 @@ def test_the_mean_over_n_needs_all_of_its_cells(runs: tuple[Run, ...]):
         more.append(make_run(f"unseen_so2_{n}_100", [1.0, 1.0, 9.0, 9.0]))
         assert label not in rows(sections(more))
         more.append(make_run(f"unseen_equivariant_transporter_{n}_100", [1.0, 1.0, 1.0, 1.0]))
-    # The mean of three times -50 and once +25.
+    # The mean of the differences -50, -50, -50 and +25.
     assert rows(sections(more))[label] == ["-31.2 (-31.2 to -31.2)"] * 2
 
 
@@ -143,7 +143,7 @@ def test_trainings_are_compared_from_two_on(runs: tuple[Run, ...]):
     more = [*runs, make_run("unseen_so2_180_100_seed2", [1.0, 1.0, 1.0, 1.0])]
     found = rows(sections(more))
     ours = found["SO(2)-equivariant (ours)", "unseen"]
-    # 75 and 100.
+    # The two trainings have 75 % and 100 %.
     assert ours == ["75.0 / 75.0", "-", "100.0 / 100.0", "87.5 ± 17.7 / 87.5 ± 17.7"]
     assert ("Equivariant Transporter", "unseen") not in found
     theirs = "unseen_equivariant_transporter_180_100_seed2"
@@ -184,7 +184,7 @@ def test_a_matched_baseline_is_compared_with_the_usual_one_and_with_ours():
 def test_an_interval_over_tools_needs_drawn_tools():
     pair = [make_run(f"{task}_so2_180_100", [1.0, 1.0, 1.0, 1.0]) for task in ("seen", "unseen")]
     for run in pair:
-        # Every tool fails once, so the interval is defined.
+        # Every object of the first episode fails, so that the interval over tools is defined.
         first = run.summary["outcomes"][0]
         first["objects"] = dict.fromkeys(first["objects"], 0)
     every = sections(pair).split("### Every cell")[1]

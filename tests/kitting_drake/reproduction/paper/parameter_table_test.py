@@ -12,14 +12,14 @@ from kitting_drake.reproduction.paper.parameter_table import (
 
 
 def share(method: str, preset: str) -> float:
-    """The share of the original's parameters."""
+    """The number of parameters, as a fraction of those of the method's original."""
     return sum(count_parameters(method, preset).values()) / original_parameters(method)
 
 
 def test_the_paper_preset_has_the_authors_sizes():
     found = count_parameters("so2", "paper")
     assert found == pytest.approx(ORIGINAL, rel=1e-3)
-    # The paper gives 4.54 M; the authors' angle network has 0.90 M at N = 36.
+    # The paper gives 4.54 million per network; the authors' angle network has 0.90 at N = 36.
     theirs = count_parameters("equivariant_transporter", "paper")
     assert [round(theirs[name] / 1e6, 2) for name in COLUMNS] == [4.54, 0.90, 4.54, 4.54]
 
@@ -29,7 +29,7 @@ def test_matched_baselines_keep_the_share_of_so2():
     ours = share("so2", "small")
     assert share("transporter", "small") < 0.4 * ours
     assert share("transporter", "matched") == pytest.approx(ours, rel=0.02)
-    # The Equivariant Transporters differ only in the angle network.
+    # The Equivariant Transporter's presets differ only in the angle network.
     small, matched = (
         count_parameters("equivariant_transporter", preset) for preset in ("small", "matched")
     )

@@ -43,7 +43,7 @@ COUNTED = ("orientations", "demonstrations", "steps", "seed")
 
 
 class Pretending(Queue):
-    """A queue whose commands only write the files of the real ones."""
+    """A queue with fake commands, which only write the files that the real ones would write."""
 
     def __init__(self, *arguments, **options) -> None:
         super().__init__(*arguments, **options)
@@ -52,7 +52,7 @@ class Pretending(Queue):
         self.why = "it broke"
         self.commit = "c0ffee"
         self.collected: dict[str, int] = {}
-        """The number of requested demonstrations, by folder."""
+        """The number of demonstrations that were requested, by the name of their folder."""
 
     def _command(self, verb: str, *arguments, folder: Path) -> None:
         self.calls.append(f"{verb} {folder.name}")
@@ -69,7 +69,7 @@ class Pretending(Queue):
             summary = {"best": {"cost_mm": 1.0 if rate == LEARNING_RATES[1] else 2.0}}
             summary |= {key: int(flags[f"--{key}"]) for key in COUNTED}
             if folder.name.startswith("stack_block_pyramid"):
-                # On a Ravens task the loss chooses, and the cost is ignored.
+                # On a Ravens task the learning rate is chosen by the loss, not by the cost.
                 summary["best"]["loss"] = 7.0 + (rate != LEARNING_RATES[0])
             summary |= {"method": flags["--method"], "preset": flags["--preset"]}
             summary["angle_only"] = "--angle-only" in words
@@ -219,7 +219,7 @@ def test_a_training_may_fix_its_learning_rate(queue: Pretending):
 
 
 def test_networks_that_do_not_depend_on_n_are_trained_once(queue: Pretending):
-    """For the Equivariant Transporter these are all but the angle network."""
+    """In the Equivariant Transporter, only the angle network depends on N."""
     costs = {f"{rate:g}": rate for rate in LEARNING_RATES}
     (queue.results / RATES).write_text(json.dumps({"unseen_equivariant_transporter": costs}))
     cells = {cell.name: cell for cell in paper_cells()}
@@ -271,7 +271,7 @@ def test_a_matched_baseline_is_another_training(queue: Pretending):
         other = dataclasses.replace(chance, policy=dataclasses.replace(chance.policy, **change))
         assert other.policy.name != chance.policy.name
         assert other.departure(summary) == said
-    # Only the Equivariant Transporter's angle network is larger: its base is that of figure 6.
+    # The Equivariant Transporter's base, which is trained first, is the same as for figure 6.
     theirs = cells["unseen_equivariant_transporter_36_100_every_chance"].policy
     assert theirs.base == cells["unseen_equivariant_transporter_180_100"].policy
     queue.calls.clear()
@@ -328,7 +328,7 @@ def test_a_diverging_learning_rate_is_the_worst(queue: Pretending):
 
 
 def test_existing_demonstrations_are_checked_once(queue: Pretending):
-    """`collect` rejects demonstrations of another scenario."""
+    """The check is a call of `collect`, which rejects demonstrations of another scenario."""
     queue.collect(TASKS["unseen"], validation=False)
     again = Pretending(queue.folder, queue.results, Console(quiet=True))
     for _ in range(2):
@@ -338,7 +338,7 @@ def test_existing_demonstrations_are_checked_once(queue: Pretending):
 
 @pytest.fixture(scope="module")
 def summaries(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Summary]:
-    """The summaries of two filled cells."""
+    """The summaries of two cells of the paper's tables, made by a fake queue."""
     folder = tmp_path_factory.mktemp("queue")
     Pretending(folder / "work", folder, Console(quiet=True)).run([OURS, ORACLE])
     return read_summaries(folder)
@@ -401,7 +401,7 @@ def test_a_training_of_an_earlier_version_is_not_reused(queue: Pretending):
 
 
 def test_a_failed_command_is_reported_by_its_last_line_and_not_repeated(tmp_path: Path):
-    """This uses the real `_command`, with a verb that does not exist."""
+    """The queue's real `_command` gets a verb that does not exist."""
     queue = Queue(tmp_path / "work", tmp_path / "results", Console(quiet=True))
     folder = tmp_path / "work" / "trainings" / "one"
     said = r"nothing failed with exit code 1: .*No module named kitting_drake\.nothing"
@@ -448,7 +448,7 @@ def test_the_exit_code_reports_failures(
 
 @pytest.mark.slow
 def test_stopping_the_queue_stops_its_child_process(tmp_path: Path):
-    """This uses the real commands, which lock their folders."""
+    """The real commands run, which lock their folders."""
     command = [sys.executable, "-m", "kitting_drake.benchmark", "paper"]
     command += ["--cells", "unseen_quantized_oracle_180", "--results", str(tmp_path / "results")]
     work = tmp_path / "work"
