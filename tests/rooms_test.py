@@ -36,11 +36,11 @@ ANY_SIZE = {ROOT / "systems", ROOT / "tests" / "systems"}
 
 Module = str
 Imports = dict[Module, dict[Module, int]]
-"""For each module, the imported modules of the tree and the lines of the imports."""
+"""For each module, the modules of the project that it imports, and the lines of the imports."""
 
 
 class Tree:
-    """The sources of `kitting_drake/` and `systems/`, and what they import."""
+    """The sources of `kitting_drake/` and `systems/`, and the modules that they import."""
 
     def __init__(self) -> None:
         self.files = {
@@ -61,7 +61,7 @@ class Tree:
                     self.outside[name].add(imported.partition(".")[0])
 
     def loaded(self, *names: Module) -> set[str]:
-        """The external modules that importing some modules loads."""
+        """The external modules that are loaded if modules of the project are imported."""
         outside: set[str] = set()
         waiting, found = list(names), set()
         while waiting:
@@ -80,7 +80,7 @@ class Tree:
     def _imported(
         self, name: Module, statements: Iterable[ast.AST]
     ) -> Iterator[tuple[Module, int]]:
-        """The imports among the statements of a file."""
+        """The imported modules, with line numbers, of the imports among a module's statements."""
         is_package = self.files[name].name == "__init__.py"
         package = name.split(".") if is_package else name.split(".")[:-1]
         for node in statements:
@@ -105,8 +105,10 @@ class Tree:
         return room if room in ROOMS and name != "kitting_drake.hkd.__main__" else "verbs"
 
     def folder(self, name: Module) -> str:
-        """The folder of a module. An `__init__.py` counts as above the other files of its folder,
-        which it re-exports."""
+        """The folder of a module, relative to the root.
+
+        An `__init__.py` re-exports the other files of its folder, so it counts as its own folder.
+        """
         path = self.files[name]
         if self.room(name) == "verbs":
             return "verbs"
@@ -118,7 +120,8 @@ def _statements(node: ast.AST, *, loaded: bool = False) -> Iterator[ast.AST]:
 
     Args:
         node: a module or a statement.
-        loaded: only those that importing the module runs: none in functions or for type checkers.
+        loaded: only the statements that run when the module is imported. Statements in functions
+            and those for type checkers do not.
     """
     for child in ast.iter_child_nodes(node):
         if not isinstance(child, ast.stmt | ast.ExceptHandler | ast.match_case):
@@ -140,7 +143,7 @@ def _module(path: Path) -> Module:
 
 
 def circle(graph: Mapping[str, Iterable[str]]) -> list[str]:
-    """The nodes of a cycle of a graph; empty if it is acyclic."""
+    """The nodes of a cycle of a graph; empty if the graph has no cycle."""
     try:
         TopologicalSorter(graph).prepare()
     except CycleError as error:
@@ -208,7 +211,7 @@ LAZY = {
     "kitting_drake.policies.networks.weights": {"pydrake", "escnn"},
     "kitting_drake.policies.matching.shape_matching": {"pydrake", "torch", "escnn"},
 }
-"""Packages that load slowly, or may be missing, and that these modules import when needed."""
+"""By module, the slow or optional packages that it may import only when they are needed."""
 
 
 @pytest.mark.parametrize("name", LAZY)

@@ -63,11 +63,11 @@ OBJECT_KEYS = {
 
 
 ONE_OF_EACH_KIND = {"kits:OneTool", "ravens:AlignBoxCorner", "kitting_unseen:ShapeMatching"}
-"""The tests of the other scenarios are slow; `schema_test` loads them all."""
+"""The scenarios that are run by default; the others are slow tests, but `schema_test` loads all."""
 
 
 def shipped() -> list[Any]:
-    """Every scenario of every file under scenarios/."""
+    """The path and name of every scenario of every file under scenarios/, as test parameters."""
     return [
         pytest.param(
             path,
@@ -115,7 +115,7 @@ def test_shipped_scenarios_run(
     assert [item["name"] for item in results["objects"]] == [item.name for item in counted]
     for item in results["objects"]:
         assert item.keys() >= OBJECT_KEYS
-        assert item["name"] in shown  # In the table.
+        assert item["name"] in shown  # The printed table has each object.
         assert item["success"] or item["cause"] in scenario.task.causes
     assert diagram.read_text().startswith("digraph")
     for system in ("plant", "policy", "planner", "controller", "monitor"):
@@ -129,7 +129,7 @@ def test_quiet_prints_nothing(verb: Verb, tmp_path: Path):
 
 
 def test_ctrl_c_leaves_complete_files(verb: Verb, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """The signal comes at a fixed moment of the episode, so that the test is deterministic."""
+    """SIGINT comes at a fixed moment of the episode, so that the test is deterministic."""
     run_chosen = running.run_chosen
 
     def interrupt(event: ModeChange) -> None:
@@ -229,7 +229,7 @@ Mine:
 
 @pytest.fixture
 def learned(tmp_path: Path) -> Path:
-    """A scenario file that expects weights beside it."""
+    """A scenario file whose weights should lie beside it."""
     path = tmp_path / "mine.yaml"
     path.write_text(LEARNED)
     return path
@@ -250,7 +250,7 @@ def test_saves_a_picture_of_each_decision(
     assert (out / "decisions" / "decision_01.png").read_bytes().startswith(b"\x89PNG")
     results = json.loads((out / "results.json").read_text())
     assert (results["policy"], results["failure"]) == ("learned", None)
-    # The tool and its recess are seen, so even untrained networks act; time ends their action.
+    # The tool and its recess are seen, so even untrained networks act; the time limit ends the run.
     assert (results["stop_reason"], results["actions"]) == ("time", 1)
 
 

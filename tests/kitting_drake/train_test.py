@@ -77,7 +77,7 @@ def demos(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def words(demos: Path, folder: Path, *more: object) -> list[str]:
-    """The arguments of `python -m kitting_drake.train`."""
+    """The arguments of `python -m kitting_drake.train` for a short run, and `more`."""
     # Few orientations are faster.
     flags = ("--preset", "tiny", "--orientations", 36, "--steps", 4)
     flags += ("--validate-every", 3, "--learning-rate", "0.01")
@@ -88,7 +88,7 @@ def train(demos: Path, folder: Path, *more: object) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", ["train", *words(demos, folder, *more)])
         patch.setattr(training_run, "_CHECKPOINT_EVERY", 2)
-        # Some of few steps have a final observation.
+        # Draw final observations often, so that some of the few steps have one.
         patch.setattr(steps, "_STOP_PROBABILITY", 0.5)
         assert training.main() == 0
 
@@ -125,11 +125,11 @@ def test_writes_weights_and_their_card(trained: Path):
     file = read_weights_file(trained / "policy.safetensors")
     assert (file.config.method, file.config.preset) == ("so2", "tiny")
     assert file.card["scenario"] == "mine"
-    # A tenth is held out, but at least one.
+    # A tenth of the demonstrations is held out for validation, but at least one.
     assert file.card["demonstrations"] == 3
     assert file.card["demonstration_seeds"] == [10, 11, 12]
     assert file.card["validation_seeds"] == [13]
-    # In the first observation, both objects are valid picks.
+    # Each demonstration has three samples: both objects are valid picks in its first observation.
     assert file.card["samples"] == 3 * 3
     assert file.card["final_observations"] == 3
     assert not (file.card["taken_only"] or file.card["rigid"])
@@ -141,7 +141,7 @@ def test_writes_weights_and_their_card(trained: Path):
     best = file.card.pop("validation")
     assert summary["best"] == best
     assert best["stop_threshold"] == threshold
-    # Two scenes, and one final observation.
+    # Validation has two scenes and one final observation.
     assert 0 <= best["false_stops"] + best["missed_stops"] <= 3
     assert summary.items() >= file.card.items()
     assert summary["wall_seconds"] > 0
@@ -188,7 +188,7 @@ def test_angle_only_with_another_n(demos: Path, tmp_path: Path, method: str):
         torch.testing.assert_close(new[name], old[name], atol=1e-5, rtol=1e-4)
     others = old.keys() - shared
     assert others == new.keys() - shared
-    # N is part of the baseline's angle network.
+    # Only the Equivariant Transporter's angle network depends on N.
     alike = all(old[name].shape == new[name].shape for name in others)
     assert alike == (method == "so2")
     file = read_weights_file(path)
@@ -279,7 +279,7 @@ def test_the_task_determines_labels_and_augmentation(
     found = (file.card["taken_only"], file.card["rigid"], file.card["reflection"])
     assert found == (taken_only, rigid, reflection)
     assert file.card["samples"] == (2 if taken_only else 3)
-    # Without final observations there is no stop network.
+    # Without final observations, the networks do not learn to stop.
     assert not file.config.stop
     assert file.card["stop_threshold"] is None
     assert "false_stops" not in file.card["validation"]
@@ -342,7 +342,7 @@ def tensors(folder: Path) -> dict[str, torch.Tensor]:
 
 
 def assert_same_outcome(folder: Path, other: Path) -> None:
-    """Equal bit by bit."""
+    """Checks that two runs have bit-identical logs, weights and checkpoints."""
     assert (folder / "log.jsonl").read_text() == (other / "log.jsonl").read_text()
     one, two = tensors(folder), tensors(other)
     assert all(torch.equal(one[name], two[name]) for name in one.keys() | two.keys())
@@ -370,7 +370,7 @@ def test_signals_save_the_last_step(
 
     def step_and_interrupt(self: Trainer, *arguments: Any) -> dict[str, float]:
         if self.step_count == 2:
-            # In the middle of a step, and between two checkpoints.
+            # The signal comes in the middle of a step, between two checkpoints.
             os.kill(os.getpid(), number)
         return step(self, *arguments)
 
@@ -489,13 +489,13 @@ def test_refuses(
     demos: Path, tmp_path: Path, refused: Callable[..., str], flags: tuple, sentence: str
 ):
     assert sentence in refused(demos, tmp_path, *flags)
-    # A refused run leaves the folder unclaimed.
+    # A refused run writes nothing into the folder.
     assert not list(tmp_path.iterdir())
 
 
 VALIDATIONS = {
     "overlapping": (range(13, 15), ORIGIN, "share seed 13"),
-    # Time limit, tries and fields that older files lack do not affect the scenes.
+    # The scenes are the same with another time limit, other tries, or a field that is new.
     "the same tables": (
         range(13, 15),
         dataclasses.replace(
@@ -504,7 +504,7 @@ VALIDATIONS = {
         ),
         "share seed 13",
     ),
-    # Distractors do not affect the tools.
+    # With distractors, the tools are the same.
     "the same tables with boxes": (
         range(13, 15),
         dataclasses.replace(ORIGIN, scenario={"task": {"_tag": "!Kitting", "distractors": 4}}),
@@ -548,11 +548,11 @@ def static_scenes(path: Path, *counts: int, batch: int = 1) -> Path:
 @pytest.mark.parametrize(
     ("batch", "count", "expected"),
     [
-        # Training and validation share no batch.
+        # The training and validation scenes are not from the same batch.
         (8, None, (16, 4)),
         (8, 9, (9, 1)),
         (1, None, (19, 1)),
-        # Validation starts at the next batch and has a tenth as many scenes.
+        # Validation starts at the next batch, with a tenth as many scenes as training.
         (5, 13, (13, 1)),
     ],
 )
@@ -562,7 +562,7 @@ def test_validation_scenes_have_other_tools(
     path = static_scenes(tmp_path / "scenes.h5", *range(1, 21), batch=batch)
     learned, kept = training._split(path, count, None)
     assert (learned.count, kept.count) == expected
-    # The number of actions identifies a scene.
+    # Scene i has i + 1 actions.
     last, first = (len(data.items.scenes[i].actions) - 1 for data, i in ((learned, -1), (kept, 0)))
     assert last // batch < first // batch
 
@@ -653,7 +653,7 @@ def test_another_scenario_or_version_is_another_run(
 
 
 def test_other_images_are_another_run(folder: Path, tmp_path: Path, refused: Callable[..., str]):
-    """Other code may collect other images from the same seeds."""
+    """Demonstrations can have other images with the same seeds, as other code collected them."""
     path = tmp_path / "others.h5"
     changed = demonstration(10)
     brighter = dataclasses.replace(changed.steps[0], height=changed.steps[0].height + 0.001)
@@ -693,7 +693,7 @@ def test_a_nan_loss_ends_the_run(demos: Path, tmp_path: Path, monkeypatch: pytes
     assert not (tmp_path / "checkpoint.pt").exists()
 
 
-# Save checkpoints often, and do not clip displacements, so that they differ.
+# Saves checkpoints often, and does not clip displacements, so that checkpoints differ in them.
 KILLABLE = """
 from kitting_drake import train
 from kitting_drake.policies.training import training_run, validation

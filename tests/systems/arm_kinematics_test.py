@@ -43,7 +43,7 @@ def test_the_hand_points_down_at_the_pose():
     for q in solutions:
         np.testing.assert_allclose(hand_state(q.tolist(), [0.0] * 7, BASE)[:4], pose, atol=1e-9)
         np.testing.assert_allclose(joint_frames(q)[0][7, :, 2], [0, 0, -1], atol=1e-9)
-    # The arm stands in the vertical plane through its base and the hand.
+    # In one of the solutions, the arm is in the vertical plane through its base and the hand.
     assert np.abs(solutions[:, [2, 4]]).max(axis=1).min() < 1e-6
     np.testing.assert_allclose(BASE.to_world(fingertips(solutions)), [pose[:3]] * len(solutions))
 
@@ -72,6 +72,6 @@ def test_the_velocity_limits_of_an_fr3_depend_on_the_position():
     low, high = FR3.velocity_bounds(q)
     assert high[1] < 0.5
     assert low[1] == -2.62
-    # A joint at the end of its range may hardly move on.
+    # At the ends of the joints' ranges, hardly any velocity beyond is allowed.
     assert np.abs(FR3.velocity_bounds(np.array(FR3.upper))[1]).max() < 0.2
     np.testing.assert_array_equal(PANDA.velocity_bounds(q)[1], PANDA.velocity)

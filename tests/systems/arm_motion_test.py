@@ -30,7 +30,7 @@ def motion_of(
 
 
 def set_action(state: ArmState, pick: tuple, place: tuple) -> None:
-    """A tool of 25 mm height on the table goes into a kit of 50 mm."""
+    """Sets an action that brings a tool, 25 mm high, from the table into a kit, 50 mm high."""
     state.pick, state.place = pick, place
     state.grasp_z, state.pick_top_z, state.table_z = 0.015, 0.025, 0.0
     state.clear_z = HIGHEST + PARAMETERS.travel_clearance
@@ -46,13 +46,13 @@ def random_action(rng: np.random.Generator) -> tuple[tuple, tuple]:
 
 
 def states(motion: ArmMotion, state: ArmState, start: float, end: float) -> NDArray:
-    """(n, 21) at every millisecond."""
+    """The motion at every millisecond, as an array (n, 21)."""
     times = start + np.arange(math.ceil(1000 * (end - start))) / 1000
     return np.array([motion.motion_at(state, time) for time in times])
 
 
 def check_limits(limits: ArmLimits, samples: NDArray, inertia: ArmInertia) -> None:
-    """Checks every limit, and that velocities and accelerations are derivatives."""
+    """Checks every limit, and that velocities and accelerations are the positions' derivatives."""
     q, v, a = np.split(samples, 3, axis=1)
     low, high = limits.velocity_bounds(q)
     assert (q >= limits.lower).all()
@@ -66,14 +66,18 @@ def check_limits(limits: ArmLimits, samples: NDArray, inertia: ArmInertia) -> No
     torques = np.einsum("nij,nj->ni", torques, a)
     assert (np.abs(torques) <= limits.torque).all()
     assert (np.abs(np.diff(torques, axis=0)) / 1e-3 <= limits.torque_rate).all()
-    # Within what the jerk allows between two samples.
+    # Differences may deviate from derivatives by what the jerk can change between two samples.
     allowed = 1e-3 * np.array(limits.jerk) * 1e-3 / 2
     assert (np.abs(np.diff(v, axis=0) / 1e-3 - a[:-1]) <= 1e-3 * np.array(limits.jerk)).all()
     assert (np.abs(np.diff(q, axis=0) / 1e-3 - (v[:-1] + v[1:]) / 2) <= allowed).all()
 
 
 def check_random_ways(model: str, actions: int, seed: int) -> int:
-    """All ways of some actions, some of them cut short by a stop; returns how many."""
+    """Checks the limits on all ways of random actions, some of them cut short by a stop.
+
+    Returns:
+        The number of ways.
+    """
     limits, rng = ARM_LIMITS[model], np.random.default_rng(seed)
     inertia = ArmInertia(arm_model(FrankaArm(model=model))[0])
     motion, time, ways = ArmMotion(PARAMETERS, limits, BASE, inertia=inertia), 1.0, 0
@@ -88,7 +92,7 @@ def check_random_ways(model: str, actions: int, seed: int) -> int:
             lasts = motion.arrival(state) - time
             ways += 1
             if rng.random() < 0.3:
-                # Stop on the way.
+                # Release the object on the way.
                 later = time + rng.uniform(0.0, lasts)
                 samples.append(states(motion, state, time, later))
                 hand = motion.postures.hand_pose(motion.motion_at(state, later)[:7])
@@ -98,7 +102,7 @@ def check_random_ways(model: str, actions: int, seed: int) -> int:
             time += lasts
             at_rest = motion.motion_at(state, time)
             np.testing.assert_allclose(at_rest[7:], 0.0, atol=1e-12)
-    # Successive ways do not begin at whole milliseconds: check each on its own.
+    # Ways do not begin at whole milliseconds, so check the limits on each by itself.
     for part in samples:
         if len(part) > 2:
             check_limits(limits, part, inertia)
@@ -152,7 +156,7 @@ def test_the_hand_s_acceleration_is_that_of_the_joints():
     ("pick", "place", "tilts"),
     [
         ((0.39, 0.31, 1.44), (0.37, -0.13, 1.48), False),
-        # The arm must be in its vertical plane at the place, and cannot at the pick.
+        # The arm can be in its vertical plane at the place only, and must leave it at the pick.
         ((0.348, 0.008, 1.396), (0.719, -0.166, -1.358), True),
     ],
 )
@@ -175,7 +179,7 @@ def test_where_the_arm_leaves_its_vertical_plane_the_hand_clears_everything(
         tips = BASE.to_world(fingertips(q))
         away = np.linalg.norm(tips[:, :2] - tips[0, :2], axis=1) > 0.007
         near = np.linalg.norm(tips[:, :2] - tips[-1, :2], axis=1) < 0.021
-        # The ends of the open jaws, or of an object of 0.2 m.
+        # `reach` is half the length of a carried object of 0.2 m, or of the open jaws.
         reach, clear = (0.1, state.travel_z) if mode == Mode.LIFT else (0.04, state.clear_z)
         lowest = tips[:, 2] - reach * np.sqrt(np.maximum(1 - down**2, 0))
         assert lowest[away & ~near].min() > clear - 0.004
@@ -202,17 +206,17 @@ def test_the_hand_follows_its_heights(has_inertia: bool):
     np.testing.assert_allclose(hand[:3], [0.5, -0.3, PARAMETERS.floor_clearance], atol=1e-6)
     turn = math.remainder(float(hand[3]) - 2.0, math.pi)
     assert abs(turn) < 1e-6
-    # The hand points down, also on the way.
+    # On all ways the hand points down.
     assert max(down.max() for down in downs.values()) < -0.9999
     lift = tips[Mode.LIFT]
     away = np.linalg.norm(lift[:, :2] - (0.6, 0.3), axis=1)
     near = np.linalg.norm(lift[:, :2] - (0.5, -0.3), axis=1)
-    # Averaged corners dip a little.
+    # Averaging rounds off the corners of the way, so it may be a little too low there.
     assert lift[(away > 0.007) & (near > 0.021), 2].min() > state.travel_z - 0.004
     assert lift[-1, 2] == pytest.approx(state.place_hover_z)
     for mode, goal in ((Mode.DESCEND, (0.6, 0.3)), (Mode.LOWER, (0.5, -0.3))):
         assert np.abs(tips[mode][:, :2] - goal).max() < 1e-4
-    # As slow as a floating hand where something is touched.
+    # Where the object may touch something, the hand is as slow as a floating hand.
     slow = tips[Mode.LOWER][tips[Mode.LOWER][:, 2] < 0.049, 2]
     assert np.abs(np.diff(slow) / 1e-3).max() <= 1.05 * PARAMETERS.touch_speed
 
@@ -255,7 +259,7 @@ def test_what_cannot_be_reached_is_said():
     assert problem(0.5, 0.2) == ""
     assert "out of the arm's reach" in problem(0.95, 0.3)
     assert "out of the arm's reach" in problem(0.5, 0.0, high=1.2)
-    # The forearm would lie in a wall of bins.
+    # So far below the surface around the hand, the forearm would collide with it.
     deep = HandStop("the place", 0.5, 0.2, 0.3, low=-0.2, high=0.1, surface=0.0)
     assert "collide" in reach_problem(postures, [deep])
     post = Capsule((0.6, 0.0, -0.5), (0.6, 0.0, 0.3), 0.02)
@@ -284,8 +288,8 @@ def test_the_way_back_and_the_held_object_must_be_free_too():
         assert motion.prepare(state) == (not said)
         return said
 
-    # Beside the hand's way, where the tool passes.
+    # The first post is beside the hand's way, but the carried tool would hit it.
     assert "on the way to the place" in problem(Capsule((0.7, 0.0, 0.0), (0.7, 0.0, 0.07), 0.02))
     assert problem(Capsule((0.8, 0.0, 0.0), (0.8, 0.0, 0.07), 0.02)) == ""
-    # Only the retreat passes above the place.
+    # Only the way home passes through the space high above the place.
     assert "home" in problem(Capsule((0.55, -0.3, 0.46), (0.55, -0.3, 0.48), 0.03))

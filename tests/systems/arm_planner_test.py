@@ -19,7 +19,7 @@ PICK, PLACE = PlanarPose(0.5, 0.3, 0.5), PlanarPose(0.55, -0.2, -0.8)
 TOO_FAR = PlanarPose(0.95, -0.6, 0.0)
 HEIGHTS = SurfaceHeights(pick_top=0.03, place_rim=0.05, place_floor=0.0, highest=0.05)
 WIDTH, FLOOR = 0.02, 0.004
-"""Of the object; height of the fingertips when it touches its floor."""
+"""The object's width, and the height of the fingertips when it touches its floor, in m."""
 
 
 class PerfectArm(LeafSystem):
@@ -53,7 +53,7 @@ class PerfectArm(LeafSystem):
 
 
 class TwoActions(LeafSystem):
-    """One action that is out of reach, one that is not, then a stop."""
+    """A policy with one action that is out of reach, one that is within reach, then a stop."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -70,7 +70,7 @@ class TwoActions(LeafSystem):
 
 
 def run() -> tuple[list[Mode], tuple, np.ndarray]:
-    """Modes, attempts, and the commanded motion at each step."""
+    """The modes of an episode, its attempts, and the commanded motion at each step."""
     builder = DiagramBuilder()
     planner = builder.AddSystem(
         PickPlacePlanner(
@@ -120,7 +120,7 @@ def test_an_arm_does_what_it_can_reach_and_refuses_the_rest():
         Mode.DONE,
     ]
     assert [attempt.outcome for attempt in history] == ["unreachable", "placed"]
-    # Nothing moves before the second action.
+    # The arm does not move for the first action.
     moving = np.flatnonzero(np.abs(motions[:, 7:14]).max(axis=1) > 0)
     assert moving[0] / 128 > 0.2
 

@@ -1,4 +1,4 @@
-"""The map agrees with numerical inverse kinematics, and with the published figures of the cell."""
+"""The reach map agrees with numerical inverse kinematics, and with known figures of the cell."""
 
 import math
 
@@ -15,11 +15,11 @@ LEVELS = np.array([0.02, 0.15, 0.28])
 
 
 def is_reached(base: ArmBase, x: float, y: float, z: float, yaw: float, model: str) -> bool:
-    """Whether a solver finds joint positions, from several starts; about flange and hand only."""
+    """Whether a solver finds joint positions for a pose of the hand, from several starts."""
     limits = ARM_LIMITS[model]
     lower, upper = np.array(limits.lower) + MARGIN, np.array(limits.upper) - MARGIN
     px, py, pz, turn = base.to_base([x, y, z, yaw]).tolist()
-    # The hand is rotated by -45 degrees at the flange; its z points down.
+    # The hand is mounted at -45 degrees to the flange, whose z axis points down.
     cos, sin = math.cos(turn - math.pi / 4), math.sin(turn - math.pi / 4)
     rotation = np.array([[cos, sin, 0], [sin, -cos, 0], [0, 0, -1]])
     goal = np.array([px, py, pz + FINGERTIP_DISTANCE])
@@ -42,7 +42,10 @@ def is_reached(base: ArmBase, x: float, y: float, z: float, yaw: float, model: s
 
 
 def disagreements(count: int, model: str, seed: int) -> int:
-    """Of poses that are not within 5 mm of the edge of the reach."""
+    """The number of random poses about which the map and the solver disagree.
+
+    Poses within 5 mm of the edge of the reach are left out.
+    """
     rng = np.random.default_rng(seed)
     reach = ReachMap(ARM_LIMITS[model], LEVELS)
     wrong = 0
@@ -63,7 +66,7 @@ def disagreements(count: int, model: str, seed: int) -> int:
 
 
 def test_the_cells_workspace():
-    """As a probe measured it, on a grid of 50 mm with the workspace's edges."""
+    """The expected shares were measured once, on a grid of 50 mm with the workspace's edges."""
     x, y = np.linspace(0.25, 0.75, 11), np.linspace(-0.5, 0.5, 21)
     points = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
     reach = ReachMap(FR3, np.linspace(0.02, 0.28, 6))

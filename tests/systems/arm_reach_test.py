@@ -1,4 +1,7 @@
-"""Reach by the closed form, against a numerical search that shares only the forward kinematics."""
+"""The closed form of reach agrees with a numerical search.
+
+The two share only the forward kinematics.
+"""
 
 import math
 
@@ -16,14 +19,16 @@ STARTS, STEPS = 48, 60
 _MOUNT = np.array([math.cos(math.pi / 4), -math.sin(math.pi / 4), 0.0])
 _TIP = 0.1121
 _ROTATION = 0.3
-"""Weight of an error in direction, in m."""
+"""The weight of errors in direction (rad) relative to errors in position, in m."""
 
 
 def search(limits: ArmLimits, pose: NDArray, rng: np.random.Generator) -> bool:
-    """Whether damped least squares from random starts, within the ranges, reaches a pose.
+    """Whether damped least squares, from random starts, finds joint positions for a pose.
 
     Args:
-        pose: (4) x, y, z, yaw in the base; the yaw may be turned by pi.
+        limits: the limits of the arm, whose ranges the joints must keep.
+        pose: x, y, z, yaw (4) in the base's frame; a yaw that is off by pi counts as reached.
+        rng: draws the starts.
     """
     lower, upper = np.array(limits.lower) + MARGIN, np.array(limits.upper) - MARGIN
     x, y, z, yaw = pose
@@ -45,7 +50,7 @@ def search(limits: ArmLimits, pose: NDArray, rng: np.random.Generator) -> bool:
         axes = np.cross(turns.swapaxes(1, 2), axis[:, None]).swapaxes(1, 2)
         mounts = np.cross(turns.swapaxes(1, 2), mount[:, None]) @ across
         J = np.concatenate([moves, _ROTATION * axes, _ROTATION * mounts[:, None]], axis=1)
-        # A joint at an end of its range moves inwards only.
+        # Joints at an end of their range may move inwards only.
         slope = np.einsum("nij,ni->nj", J, error)
         stuck = ((q <= lower) & (slope > 0)) | ((q >= upper) & (slope < 0))
         J = J * ~stuck[:, None]
@@ -59,7 +64,7 @@ def search(limits: ArmLimits, pose: NDArray, rng: np.random.Generator) -> bool:
 
 
 def disagreements(limits: ArmLimits, poses: int, seed: int) -> tuple[list[str], int]:
-    """Where both differ, and how many poses the search reaches."""
+    """The random poses about which both differ, as texts, and how many the closed form reaches."""
     rng, postures = np.random.default_rng(seed), ArmPostures(limits, BASE)
     reached, found = 0, []
     for _ in range(poses):
@@ -67,7 +72,7 @@ def disagreements(limits: ArmLimits, poses: int, seed: int) -> tuple[list[str], 
         yaw = rng.uniform(-math.pi, math.pi)
         stop = HandStop("the pick", x, y, yaw, low=z, high=z, surface=-1.0)
         problem = reach_problem(postures, [stop])
-        # The search knows of no collisions.
+        # The search ignores collisions, so a pose that is refused only for a collision is reached.
         says = not problem or "collide" in problem
         pose = BASE.to_base([x, y, z, yaw])
         # Few starts miss some poses that can be reached: try again where the closed form says so.

@@ -48,7 +48,7 @@ def test_described_holds_every_field(tmp_path: Path):
     assert described["cameras"]["top"]["_tag"] == "!LookAt"
     assert described["cameras"]["front"]["_tag"] == "!Pinhole"
     assert described["planner"]["search"]["amplitude"] == 0.12
-    # It is complete, and JSON preserves it.
+    # The description has all fields, and JSON preserves it.
     assert described.keys() == {item.name for item in dataclasses.fields(Scenario)}
     assert described["planner"].keys() - {"_tag"} == {
         item.name for item in dataclasses.fields(chosen.scenario.planner)
@@ -57,7 +57,7 @@ def test_described_holds_every_field(tmp_path: Path):
 
 
 def test_different_scenarios_have_different_descriptions():
-    """Commands use this to detect a folder of another scenario."""
+    """Commands compare descriptions to detect a folder of another scenario."""
     one, other = (
         ChosenScenario(scenario, Path("a.yaml"), "a", None).described
         for scenario in (Scenario(), Scenario(time_limit=2.0))

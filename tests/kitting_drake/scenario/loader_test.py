@@ -48,7 +48,7 @@ planner: {home: [0.4, 0.0, 0.5, 0.0], search: {amplitude: 0.0}}
     assert merged.task.tools == ["flat_screwdriver"]
     assert merged.cameras["top"] == Pinhole(width=99, height=77)
     assert merged.cameras["front"] == LookAt(width=100)
-    assert merged.planner.home == [0.4, 0.0, 0.5, 0.0]  # A list is replaced as a whole.
+    assert merged.planner.home == [0.4, 0.0, 0.5, 0.0]  # Lists are replaced, not merged.
     assert merged.planner.linear_speed == 0.5
     assert merged.planner.search == InsertionSearch(press=0.002, amplitude=0.0)
     assert merged.time_limit == 9.0
@@ -61,7 +61,7 @@ def test_text_removes_and_replaces_cameras(tmp_path: Path):
         "top": Pinhole(),
         "side": LookAt(height=77),
     }
-    # Another variant keeps no fields of the old one.
+    # If the text chooses another variant, no fields of the old one are kept.
     text = "cameras: {front: !Pinhole {height: 88}}"
     assert load_scenario(path, text=text).cameras["front"] == Pinhole(height=88)
 
@@ -84,7 +84,7 @@ A:
 
 
 def test_text_keeps_the_order_of_mappings(tmp_path: Path):
-    """The oracle picks tools in this order, and the last paint wins."""
+    """The order matters: the oracle picks tools in it, and the last paint that matches wins."""
     path = write(tmp_path, "A: {}")
     text = """
 task: !ArrangedKitting {tools: {slip_joint_pliers: {x: 0.3, y: 0.3}, claw_hammer: {x: 0.6, y: 0.3}}}
@@ -134,7 +134,7 @@ def test_cameras_replace_the_default_ones(tmp_path: Path):
 
 DEEP = "A: {planner: {hom: [0, 0, 0, 0]}}"
 BAD = {
-    # Not a mapping of names to scenarios.
+    # The file is not a mapping of names to scenarios.
     "not YAML": ("A: {", ["mine.yaml, line 1", "not YAML"]),
     "a list": ("[1, 2]", ["mine.yaml", "mapping"]),
     "a number": ("5", ["mine.yaml", "mapping"]),
@@ -143,7 +143,7 @@ BAD = {
     "contains itself": ("A: &a {planner: *a}", ["mine.yaml", "contains itself"]),
     "duplicate key": ("A: {time_limit: 1.0, time_limit: 2.0}", ["mine.yaml", "'time_limit'"]),
     "duplicate scenario": ("A: {}\nA: {}\n", ["mine.yaml", "'A' is given twice", "line 2"]),
-    # Fields.
+    # Unknown fields and missing values.
     "misspelt field": (DEEP, ["mine.yaml: A", "planner.hom", "did you mean 'home'?"]),
     "unlike any field": ("A: {colour: red}", ["colour", "use one of", "time_limit"]),
     "field of another variant": (
@@ -174,7 +174,7 @@ BAD = {
     "tag without a value": ("A: {policy: !Oracle }", ["mine.yaml"]),
     "empty value": ("A: {time_limit: }", ["time_limit", "empty"]),
     "empty section": ("A: {planner: }", ["planner", "empty"]),
-    # Types.
+    # Values of a wrong type.
     "text for a number": ("A: {time_limit: soon}", ["time_limit", "number", "'soon'"]),
     "quoted number": ("A: {time_limit: '3'}", ["time_limit", "number"]),
     "fraction for a whole number": ("A: {random_seed: 1.5}", ["random_seed", "whole"]),
@@ -184,7 +184,7 @@ BAD = {
     "number among strings": ("A: {task: !Kitting {tools: [1]}}", ["task.tools[0]", "string"]),
     "list for a mapping": ("A: {cameras: [1]}", ["cameras", "mapping"]),
     "text for a section": ("A: {policy: Oracle}", ["policy", "mapping"]),
-    # Values.
+    # Values that are not allowed.
     "out of range": ("A: {planner: {grasp_force: 1000.0}}", ["planner.grasp_force", "1 and 140"]),
     "out of range in a map": ("A: {cameras: {f: !Pinhole {width: 1}}}", ["cameras.f.width"]),
     "out of range in the kit": ("A: {task: !Kitting {kit: {height: 9.0}}}", ["task.kit.height"]),
@@ -289,7 +289,7 @@ def test_errors_in_scenario_text_name_the_flag():
 
 
 def test_the_merged_scenario_is_validated(tmp_path: Path):
-    """File and text are valid alone, but not together."""
+    """The file and the text are each valid, but not if they are merged."""
     path = write(tmp_path, "A: {heightmap: {z_min: -0.1}}")
     with pytest.raises(UserError, match=r"--scenario_text: heightmap\.z_max"):
         load_scenario(path, text="{heightmap: {z_max: -0.2}}")

@@ -34,7 +34,7 @@ class NoTask:
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "boxes_of_mine.py").write_text(MODULE)
-    # Leave no module of this test behind.
+    # Forget the module before and after each test.
     monkeypatch.delitem(sys.modules, "boxes_of_mine", raising=False)
     return tmp_path
 

@@ -61,7 +61,7 @@ def test_a_task_without_distractors(tmp_path: Path):
 
 
 def test_colours_that_define_a_task_are_not_perturbed():
-    """Red cubes go into green bowls, and the pyramid's cubes are placed by colour."""
+    """In one task red cubes go into green bowls, in the other the colours tell the cubes apart."""
     ravens = SCENARIOS / "ravens.yaml"
     for name in ("PlaceRedInGreen", "StackBlockPyramid"):
         perturbed = load_scenario(ravens, name, perturb="all:severe")
@@ -98,7 +98,7 @@ def test_colours_are_drawn_over_a_scenarios_own_paints(tmp_path: Path, level: st
     )
     paints = load_scenario(path, None, None, f"colour:{level}").appearance.paints
     drawn = [name for name, paint in paints.items() if isinstance(paint, Drawn)]
-    # The drawn paints come last, so they win.
+    # The random paints come last, so that they win over those of the scenario.
     assert list(paints)[-len(drawn) :] == drawn
     assert drawn == (["*", "fixtures/*"] if level == "severe" else ["*"])
     assert paints["objects/*"] == Fixed(rgb=[0, 1, 0])

@@ -36,7 +36,7 @@ GRID = PixelGrid(rows=33, cols=49)
 
 @pytest.fixture(scope="module")
 def site() -> PolicySite:
-    """A site without plant bodies."""
+    """A policy's site, without objects in a plant."""
     scene = ArrangedKitting().make_scene(grid=PixelGrid(), seed=0, base=Path())
     return PolicySite(scene=scene, objects=(), grid=GRID, base=Path())
 
@@ -46,10 +46,10 @@ def observation() -> Observation:
 
 
 def action(config: PolicyConfig, site: PolicySite, seen: Observation) -> PickPlaceAction:
-    """The action of a policy's system for an observation."""
+    """The action that a policy's system outputs for an observation."""
     system = config.make_system(site)
     context = system.CreateDefaultContext()
-    # A policy that uses heights alone has another port.
+    # A policy that uses no colours has another port.
     heights = system.HasInputPort("observation_heights")
     name = "observation_heights" if heights else "observation"
     system.GetInputPort(name).FixValue(context, Value(seen))
@@ -67,7 +67,7 @@ def test_learned_makes_the_configured_policy(
     config = Learned(weights_file.name, orientations=orientations, continuous=continuous)
     found = action(config, site, observation())
     networks = load_networks(weights_file, preferred_type())
-    # Without `continuous`, no stage refines the networks' actions.
+    # Without `continuous`, no stage refines the networks' actions; they may only stop.
     stages = make_stages(site.planner, insertion=True) if continuous else [StopRule()]
     policy = LearnedPolicy(networks, orientations=orientations, stages=stages)
     assert found == policy(observation())
@@ -130,7 +130,7 @@ def test_details_and_digests_for_results(weights_file: Path):
     }
     assert Learned(weights="").details(base)["checkpoint_step"] == 4800
     assert config.training_seeds(base) == {10_000, 10_001, 10_002}
-    # Seeds of static scenes are not seeds of episodes.
+    # The generalist learned from static scenes, whose seeds are not seeds of episodes.
     assert Learned(weights="").training_seeds(base) == set()
     assert config.digest(base) == f"sha256 {hashlib.sha256(weights_file.read_bytes()).hexdigest()}"
     with pytest.raises(UserError, match=r"gone\.safetensors"):
@@ -158,7 +158,7 @@ def test_a_users_function_and_its_digest(
     monkeypatch.syspath_prepend(tmp_path)
     config = PythonPolicy("a_policy_of_mine:act")
     assert action(config, site, observation()) == PickPlaceAction(stop=True)
-    # The digest changes with the source.
+    # The digest changes with the module's source.
     first = config.digest(tmp_path)
     path.write_text(STOP + "\n# better\n")
     assert config.digest(tmp_path) != first
@@ -196,7 +196,7 @@ def test_a_module_beside_the_scenario_is_found(site: PolicySite, tmp_path: Path)
     first = config.digest(tmp_path)
     path.write_text(FAILED + "# better\n")
     assert config.digest(tmp_path) != first
-    # `--ray` ships it with the scenario's files.
+    # The module is an input file, so that `--ray` ships it.
     assert config.input_files(tmp_path) == [path]
     assert config.modules() == ["the_policy_beside"]
     system = config.make_system(dataclasses.replace(site, base=tmp_path))

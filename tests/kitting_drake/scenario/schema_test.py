@@ -24,12 +24,13 @@ ONE_OF_EVERYTHING = [
 
 SETTLED = {"start", "tray", "faces"}
 APART = {Learned: {"avoid_failed_picks"}, Kitting: SETTLED, ToolsetKitting: SETTLED}
-"""Fields that exclude others. `policies_test` and `starts_test` cover them."""
+"""By class, the fields that cannot be given with others; `policies_test` and `starts_test` cover
+them."""
 
 
 def reachable(kind: Any) -> set[type]:
-    """The dataclasses that a value of a type of the schema may contain."""
-    if kind is PythonTask:  # Covered by `own_task_test`.
+    """The dataclasses of the schema that can occur in a value of a type, including the type."""
+    if kind is PythonTask:  # `own_task_test` covers it.
         return set()
     if dataclasses.is_dataclass(kind):
         hints = typing.get_type_hints(kind)
@@ -39,15 +40,15 @@ def reachable(kind: Any) -> set[type]:
 
 
 def is_struct(value: Any) -> bool:
-    """Whether it is one of Drake's configs."""
+    """Whether a value is one of Drake's config structs."""
     return struct_fields(type(value)) is not None
 
 
 def agrees(raw: Any, described: Any) -> bool:
-    """Whether the fields given in YAML equal those of a described Drake config."""
+    """Whether the fields that YAML gives equal those in the description of a Drake config."""
     if not isinstance(raw, dict):
         return bool(raw == described)
-    # YAML omits the name of a rotation's only field.
+    # YAML gives a rotation's only field without its name, `value`.
     inner = described if raw.keys() <= described.keys() else described["value"]
     return all(agrees(value, inner[name]) for name, value in raw.items())
 
@@ -55,16 +56,16 @@ def agrees(raw: Any, described: Any) -> bool:
 def check_given(
     kind: Any, raw: Any, loaded: Any, default: Any, where: str, *, whole: bool = True
 ) -> set[type]:
-    """Checks that every YAML value was loaded, and that none equals its default.
+    """Checks that every YAML value was loaded, and that none equals its field's default.
 
-    A value equal to its default would not show that the field was read.
+    If a value equalled the default, one could not tell whether the field was read.
 
     Args:
         kind: the type in the schema.
-        raw: the YAML, untyped.
-        loaded: the value.
-        default: the value without YAML; None if there is none.
-        where: the path, for messages.
+        raw: what YAML gives, untyped.
+        loaded: the value that was loaded.
+        default: the value of the field if YAML omits it; None if it has no default.
+        where: the path of the field, for messages.
         whole: whether every field of a dataclass must be given.
 
     Returns:
@@ -118,14 +119,14 @@ def test_one_of_everything():
     seen: set[type] = set()
     for name in ONE_OF_EVERYTHING:
         loaded = load_scenario(TEST_SCENARIOS, name)
-        # The first gives all fields of a scenario; the others cover what excludes these.
+        # The first scenario gives all fields but those that the others cover.
         whole = name == "OneOfEverything"
         seen |= check_given(Scenario, root[name], loaded, Scenario(), name, whole=whole)
     assert seen >= reachable(Scenario) - reachable(Task) - reachable(Policy)
 
 
 def test_every_variant_of_task_and_policy_is_in_some_scenario():
-    """Other tests run the shipped scenarios and build those of the tests."""
+    """So every variant is tested: other tests run or build all of these scenarios."""
     seen = set()
     for path in (TEST_SCENARIOS, *SCENARIOS.rglob("*.yaml")):
         for key, _ in yaml.compose(path.read_text(), Loader=yaml.SafeLoader).value:

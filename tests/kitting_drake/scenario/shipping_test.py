@@ -46,7 +46,7 @@ print(chosen.name, chosen.path)
 
 
 def on_a_node(shipment: Shipment, node: Path) -> str:
-    """Copies a shipment as Ray does, checks it in another process, and returns what that prints."""
+    """Copies a shipment as Ray does; returns what a process prints that uses the copy."""
     env = shipment.runtime_env
     ignored = shutil.ignore_patterns(*env["excludes"])
     shutil.copytree(env["working_dir"], node, ignore=ignored)
@@ -69,7 +69,7 @@ def on_a_node(shipment: Shipment, node: Path) -> str:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """An empty folder for links."""
+    """An empty folder, in which `pack` makes links."""
     folder = tmp_path / "links"
     folder.mkdir()
     return folder
@@ -96,13 +96,13 @@ def test_packs_all_files_of_a_scenario(
     )
     shipment = pack(chosen, folder)
     found = on_a_node(shipment, tmp_path / "node")
-    # Messages on the node name the original file.
+    # Messages on the node name the original scenario file, not its copy.
     assert found.splitlines() == [str(commit()), f"mine {mine / 'mine.yaml'}"]
     shipped = {path.name for path in folder.iterdir()}
     assert shipped == {"kitting_drake", "systems", "models", "files"}
-    # Ray rejects an empty list.
+    # Without modules there is no `py_modules`, because Ray rejects an empty list.
     assert "py_modules" not in shipment.runtime_env
-    # The original scenario is unchanged.
+    # Packing did not change the original scenario.
     assert chosen.scenario.task.tools == tools
     assert chosen.base == mine
 

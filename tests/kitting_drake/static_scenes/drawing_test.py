@@ -33,7 +33,7 @@ needs_renderer = pytest.mark.skipif(not can_render(), reason="images cannot be r
 
 @pytest.fixture(scope="module")
 def tools() -> list[RandomTool]:
-    """A composed tool, one of a design, and a simple part."""
+    """Three random tools: composed of shapes, from a family's design, and a simple part."""
     return [draw_tool(ENTRIES, np.random.default_rng(seed), str(seed)) for seed in (3, 9, 12)]
 
 
@@ -91,14 +91,14 @@ def test_picks_are_on_tools_and_places_are_in_cavities(scenes: list[StaticScene]
             pick, place = (np.rint(GRID.to_pixel(row[i : i + 2])).astype(int) for i in (2, 5))
             around = height[pick[0] - 1 : pick[0] + 2, pick[1] - 1 : pick[1] + 2]
             assert around.max() > 0.003
-            # The place is in a cavity, within the block.
+            # The place is in a cavity: near it, the height reaches the block's top.
             window = height[place[0] - 10 : place[0] + 11, place[1] - 10 : place[1] + 11]
             assert window.max() > 0.8 * top
 
 
 @needs_renderer
 def test_an_action_moves_the_tool_into_a_cavity_of_its_shape(tools: list[RandomTool]):
-    """The tool's pixels fit into the cavity after the motion of the action."""
+    """The action's motion brings the tool's pixels into the cavity."""
     rng = np.random.default_rng(5)
     tools = tools[:2]
     kit = static_scenes._draw_kit(tools, rng)
@@ -179,7 +179,7 @@ def test_samples_have_a_grasp_of_each_loose_tool():
     scene = StaticScene.of(Observation(), actions)
     final = StaticScene.of(Observation(), np.zeros((0, 8)))
     samples = StaticSamples(StaticScenes(GRID, (final, scene)))
-    # A sequence has an end, and negative indices count from it.
+    # Samples are a proper sequence: negative indices count from the end, later ones raise.
     assert (samples[-1].pick == samples[len(samples) - 1].pick).all()
     with pytest.raises(IndexError):
         samples[len(samples)]
@@ -193,6 +193,6 @@ def test_samples_have_a_grasp_of_each_loose_tool():
         }
         assert len(picks & {0, 1, 2}) == len(picks & {3, 4}) == 1
         seen |= picks
-    # Samples never use the grasp that would not hold.
+    # Samples use all grasps but the third, whose cost of 30 means that it would not hold.
     assert seen == {0, 1, 3, 4}
     np.testing.assert_array_equal(samples[3].pick, samples[3].pick)

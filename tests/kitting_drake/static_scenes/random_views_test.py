@@ -5,7 +5,7 @@ from kitting_drake.static_scenes.random_views import draw_views
 
 
 def test_random_cameras_look_at_the_workspace_from_above():
-    """They stand within 60 degrees of straight above, and look near its middle."""
+    """They look down within 60 degrees of the vertical, at a point near the workspace's middle."""
     counts, slants = [], []
     for seed in range(200):
         views = draw_views(np.random.default_rng(seed))

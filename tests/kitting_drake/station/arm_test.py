@@ -57,17 +57,17 @@ def test_ports_and_home(rig: Rig):
     sizes |= {"wrist_force": 6, "commanded_opening": 2}
     for name, size in sizes.items():
         assert rig.port(name, root).shape == (size,)
-    # The arm is where its motion begins, with the hand at the planner's home.
+    # The joints have the first commanded positions, and the hand is at the planner's home.
     state = rig.port("robot_state", root)
     np.testing.assert_allclose(state[:7], rig.port("commanded", root)[:7], atol=1e-12)
     hand = rig.port("hand_state", root)
     np.testing.assert_allclose(hand[:6], [*HOME, 0.04, 0.04], atol=1e-6)
-    # The hand has none of the floating hand's axes.
+    # The hand has only its two finger joints, not the axes of a floating hand.
     assert rig.plant.num_positions(rig.plant.GetModelInstanceByName(HAND)) == 2
 
 
 def steps(rig: Rig, seconds: float) -> NDArray[np.float64]:
-    """(n, 27) robot state and actuation after each step."""
+    """The robot's state and actuation after each step, as an array (n, 27)."""
     found = []
 
     def look(root):
@@ -89,7 +89,11 @@ def test_the_arm_follows_its_commands_and_a_rerun_is_equal(rig: Rig):
 
 
 def press(rig: Rig, force: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Pulls the waiting hand down; returns the actuation and the moved joints after 0.1 s."""
+    """Pulls the waiting hand down with a force (N) for 0.09 s.
+
+    Returns:
+        The actuation, and how far the joints have moved.
+    """
     simulator = rig.station.make_simulator(rig.diagram)
     root = simulator.get_mutable_context()
     pulled = ExternallyAppliedSpatialForce()
@@ -113,7 +117,7 @@ def test_torques_are_clipped(rig: Rig):
 
 
 class ForceLog(EpisodeLog):
-    """Also records the contact forces on the hand, from the plant's contact results."""
+    """An episode log that also records the contact forces on the hand, from the plant."""
 
     def __init__(self, rig: Rig) -> None:
         super().__init__(rig.station)
@@ -139,7 +143,7 @@ class ForceLog(EpisodeLog):
 @pytest.mark.slow
 @pytest.mark.parametrize("model", ARM_LIMITS)
 def test_an_episode_is_as_gentle_as_the_floating_hands(model: str):
-    """A set-down once read 143 N, which unloaded a pad so that the tool counted as dropped."""
+    """A hard set-down would unload a pad, so that the tool would count as dropped."""
     scenario = Scenario(robot=FrankaArm(model=model), task=Kitting(), cameras={})
     rig = build_rig(scenario, base=BASE)
     log = ForceLog(rig)
@@ -147,11 +151,11 @@ def test_an_episode_is_as_gentle_as_the_floating_hands(model: str):
     assert result.strict_success_rate == 1.0
     assert (result.missed_grasps, result.dropped_objects, result.stopped_actions) == (0, 0, 0)
     arrays = log.arrays()
-    # What the joint torques tell is the contact force.
+    # The force that is computed from joint torques equals the contact force.
     applied, felt = np.array(log.forces), arrays["wrist_force"][:, :3]
     assert np.abs(applied).max() > 5.0
     assert np.abs(felt - applied).max() < 0.01 * np.abs(applied).max()
-    # Means over two steps, as the guard takes them.
+    # The limit holds for means over two steps, which the contact guard uses.
     vertical = felt[:, 2]
     assert ((vertical[1:] + vertical[:-1]) / 2).max() < 30.0
     assert list(arrays["joint_names"]) == [f"joint{number}" for number in range(1, 8)]
@@ -160,7 +164,7 @@ def test_an_episode_is_as_gentle_as_the_floating_hands(model: str):
     assert (arrays["joint_position"] < np.array(limits.upper)).all()
     assert (np.abs(arrays["joint_velocity"]) <= np.array(limits.velocity)).all()
     assert (np.abs(arrays["joint_torque"]) < np.array(limits.torque)).all()
-    # Contacts included.
+    # The torque rates include those that contacts cause.
     rates = np.diff(arrays["joint_torque"], axis=0) / np.diff(arrays["time"])[:, None]
     assert (np.abs(rates) < np.array(limits.torque_rate)).all()
     assert np.abs(arrays["joint_position"] - arrays["commanded_position"]).max() < 0.003

@@ -17,10 +17,10 @@ COM = np.array([0.03, 0.01, -0.02])
 
 
 def step(moves: bool) -> tuple[RigidTransform, RigidTransform, RigidTransform]:
-    """A step with a body 0.1 m beside the hand, that moves with it or rests.
+    """Makes a step with a body 0.1 m beside the hand, which moves with the hand or rests.
 
     Returns:
-        X_WB before correction and after it, and if the body were welded to the hand.
+        Three X_WB after the step: uncorrected, corrected, and of a body welded to the hand.
     """
     arm, gripper = arm_model(FrankaArm())
     context = arm.CreateDefaultContext()
@@ -40,7 +40,7 @@ def step(moves: bool) -> tuple[RigidTransform, RigidTransform, RigidTransform]:
     own = plant.CreateDefaultContext()
     rate = V_WG.rotational() * moves
     speed = V_WG.Shift(p_WCom - X_WG.translation()).translational() * moves
-    # Its centre of mass goes straight on.
+    # In a time step of Drake, the body's centre of mass moves in a straight line.
     R_WB = RotationMatrix(Rotation.from_rotvec(STEP * rate).as_matrix()) @ X_WB0.rotation()
     X_WB = RigidTransform(R_WB, p_WCom + STEP * speed - R_WB @ COM)
     plant.SetFreeBodyPose(own, body, X_WB)
@@ -70,5 +70,5 @@ def test_a_body_at_rest_stays():
 def test_an_arm_that_hardly_moves_carries_nothing(rate: float):
     arm, gripper = arm_model(FrankaArm())
     state = np.concatenate([Q, np.full(9, rate)])
-    # It does not even look at the plant.
+    # The plant and its context are None: `correct` must return before it uses them.
     ArmPath(arm, gripper, STEP).correct(None, None, state, [])  # type: ignore[arg-type]

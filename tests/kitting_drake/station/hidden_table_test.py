@@ -30,7 +30,7 @@ def test_the_default_cameras_see_all_of_the_table_beside_an_arm(model: str):
 
 
 def test_a_waiting_arm_hides_more_than_its_hand():
-    # Behind the arm, which a hand alone would not hide.
+    # The camera is behind the arm: the arm hides the table, but a hand alone would not.
     behind = LookAt(position=[-0.25, 0.0, 0.9])
     hand = Scenario(cameras={"behind": behind})
     assert hidden_table_note(hand) is None
@@ -40,6 +40,6 @@ def test_a_waiting_arm_hides_more_than_its_hand():
 
 
 def test_the_hand_may_wait_at_any_y():
-    """The camera is over the end of the workspace, away from the hand's initial position."""
+    """The hand may hide the table from a camera that is over the far end of the workspace."""
     end = Pinhole(position=[0.5, -0.45, 1.1], rpy_deg=[180.0, 0.0, -90.0], focal_length=1500.0)
     assert hidden_table_note(Scenario(cameras={"end": end})) is not None

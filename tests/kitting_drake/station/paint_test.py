@@ -32,7 +32,7 @@ def observed(text: str) -> Observation:
 
 @pytest.fixture(scope="module")
 def plain() -> Observation:
-    """The observation without paint."""
+    """An observation of a scene without paint."""
     return observed("{}")
 
 
@@ -51,7 +51,7 @@ def test_drawn_colours_depend_on_the_seed(plain: Observation):
     one = observed(text).image
     np.testing.assert_array_equal(one, observed(text).image)
     changed = (one[:3] != plain.rgb).any(axis=0)
-    # The tools keep their colours.
+    # Most pixels change, but not the tools'.
     assert 0.8 < changed.mean() < 1.0
     np.testing.assert_array_equal(one[3], plain.height)
 
@@ -102,7 +102,7 @@ def test_a_models_friction_is_scaled_and_its_meshes_are_found(tmp_path: Path):
     assert "<mass>0.1805997838</mass>" in tool
     assert "mu_static>0.25<" in tool
     assert f"file://{MODELS / 'tools' / 'claw_hammer' / 'steel.obj'}" in tool
-    # Folder names may contain such characters, and Drake does not decode URIs.
+    # Such characters may be in a folder's name. They must stay, because Drake does not decode URIs.
     folder = tmp_path / "ä b#c%20d"
     shutil.copytree(MODELS / "tools" / "claw_hammer", folder)
     plant, _ = AddMultibodyPlantSceneGraph(DiagramBuilder(), time_step=0.01)
@@ -120,7 +120,7 @@ def test_the_text_of_an_unvaried_model_is_that_of_its_file(tmp_path: Path):
     text = model_text(hammer)
     assert text is not None
     assert re.findall(r"<(mass|ixx|pose|size)>([^<]*)<", text) == numbers
-    # Drake itself reads what is not SDFormat, or refers to other files.
+    # For these files no text is returned, so that Drake reads them itself.
     other = tmp_path / "other.sdf"
     for content in ("<sdf", "<sdf><include><uri>hammer.sdf</uri></include></sdf>"):
         other.write_text(content)

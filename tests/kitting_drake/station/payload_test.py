@@ -1,4 +1,4 @@
-"""An arm that holds a weight of 1 kg still."""
+"""An arm that compensates the weight of its load holds still."""
 
 import numpy as np
 from pydrake.multibody.math import SpatialForce
@@ -18,7 +18,7 @@ Q = planar(np.array([0.6, 0.1, 0.1]), np.array(0.7))
 
 
 def sag(payload: float) -> float:
-    """How far the hand sinks after 1 s under its load, in m."""
+    """How far the hand sinks within 1 s under its load (m), if the arm compensates `payload`."""
     robot = FrankaArm(base=[0.0, 0.0, 0.0])
     builder = DiagramBuilder()
     plant, _ = AddMultibodyPlantSceneGraph(builder, STEP)
@@ -60,5 +60,5 @@ def sag(payload: float) -> float:
 def test_what_was_weighed_causes_no_sag():
     assert sag(0.0) > 0.002
     assert abs(sag(-WEIGHT)) < 0.0003
-    # A weight that is wrong by a tenth.
+    # Here the weight that was measured is wrong by a tenth.
     assert abs(sag(-0.9 * WEIGHT)) < 0.001

@@ -1,4 +1,4 @@
-"""A trajectory file moves the plant's arm as it was planned."""
+"""The plant's arm follows a trajectory that is loaded from a file."""
 
 import dataclasses
 from pathlib import Path
@@ -20,12 +20,12 @@ from tests.kitting_drake.rig import build_rig
 BASE = Path(__file__).parent
 SCENARIO = Scenario(robot=FrankaArm(), task=Kitting(tools=["claw_hammer"]), cameras={})
 TRACKED = 0.002
-"""How far the joints may be from their commands, in rad."""
+"""The largest deviation of the joints from their commands that the tests allow, in rad."""
 
 
 @pytest.fixture(scope="module")
 def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The oracle's action in the scene of seed 0."""
+    """The trajectory file of the oracle's first action in the scene of seed 0."""
     rig = build_rig(SCENARIO, base=BASE)
     action, goal = rig.port("action"), rig.scene.goals[0]
     floor = float(goal.poses[0].translation()[2])
@@ -48,7 +48,7 @@ def test_the_plant_follows_the_file_and_a_replay_is_equal(file: Path):
     trajectory = load_trajectory(file)
     end = start_of(trajectory, "CLOSE")
     played = play_trajectory(SCENARIO, trajectory, base=BASE, seconds=end)
-    # The commands are the planned points.
+    # The commanded positions interpolate the planned points.
     for joint in range(7):
         planned = np.interp(played.time, trajectory.times, trajectory.positions[:, joint])
         np.testing.assert_allclose(played.commanded[:, joint], planned, atol=3e-6)

@@ -1,4 +1,4 @@
-"""An action that presses, in the physics of the station."""
+"""An action that presses an object down, simulated in the station."""
 
 import sys
 import types
@@ -20,7 +20,7 @@ from tests.kitting_drake.rig import build_rig
 @pytest.mark.parametrize("force", [pytest.param(30.0, marks=pytest.mark.slow), 60.0])
 @pytest.mark.usefixtures("rendering")
 def test_a_press_reaches_the_press_force(monkeypatch: pytest.MonkeyPatch, force: float):
-    """Includes the impact at `touch_speed` and the delay of one planner period."""
+    """The bounds allow for the impact at `touch_speed` and a delay of one planner period."""
     action = PickPlaceAction(pick=PlanarPose(0.42, 0.14), press=True)
     monkeypatch.setitem(sys.modules, "presser", types.SimpleNamespace(press=lambda _: action))
     scenario = Scenario(

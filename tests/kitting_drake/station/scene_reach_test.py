@@ -18,7 +18,7 @@ TASK = Kitting(tools=["claw_hammer", "ring_40x20x10"])
 
 
 def scenario(*base: float) -> Scenario:
-    # A home that all bases reach.
+    # The arm reaches this home from all bases.
     planner = PickPlaceParameters(home=[0.3, 0.0, 0.4, 0.0])
     return Scenario(robot=FrankaArm(base=[*base, 0.0]), task=TASK, planner=planner, cameras={})
 

@@ -53,12 +53,12 @@ def build(scenario: Scenario = BLIND) -> Rig:
 
 @pytest.fixture(scope="module")
 def rig() -> Rig:
-    """One station serves all tests, because all state is in the Context."""
+    """A station that tests can share, because all state is in the Context."""
     return build()
 
 
 def advance(rig: Rig, seconds: float, look: Callable[[Context], None] = lambda _: None) -> Context:
-    """Simulates with sleep; `look` is called after every step."""
+    """Simulates the station, in which objects at rest sleep; calls `look` after every step."""
 
     def monitor(root: Context) -> EventStatus:
         look(root)
@@ -82,7 +82,7 @@ def test_default_context_is_the_scene(rig: Rig):
     context = rig.plant.GetMyContextFromRoot(root)
     kit = rig.plant.GetBodyByName("kit").EvalPoseInWorld(context)
     assert kit.IsNearlyEqualTo(rig.scene.fixtures[0].X_WF, 1e-12)
-    # The hand is at rest at the planner's home.
+    # The hand waits at the planner's home.
     hand = rig.plant.GetModelInstanceByName("franka_hand")
     home = Scenario().planner.home
     np.testing.assert_allclose(
@@ -162,7 +162,7 @@ def test_exported_ports(
 
 
 def test_the_action_port_can_be_fixed(rig: Rig):
-    """With a fixed input port, as in the Gymnasium environments."""
+    """A station without a policy takes its action from a fixed port, as in Gymnasium."""
     station, action = build_station(BLIND), rig.port("action")
     simulator = station.make_simulator()
     root = simulator.get_mutable_context()
@@ -184,7 +184,7 @@ def test_the_oracle_starts_with_the_first_goal(rig: Rig):
     (grasp,) = rig.scene.objects[0].grasps
     expected = rig.scene.objects[0].X_WB @ np.array([grasp.x, grasp.y, 0.0])
     np.testing.assert_allclose([action.pick.x, action.pick.y], expected[:2], atol=1e-12)
-    # It knows the heights without cameras.
+    # The oracle knows the heights of surfaces without cameras.
     assert action.heights.pick_top == pytest.approx(grasp.surface_height)
     assert action.heights.place_rim == pytest.approx(Kitting().kit.height)
 
@@ -224,7 +224,7 @@ def test_objects_at_rest_fall_asleep(rig: Rig):
     assert asleep == at_rest
     assert asleep[0] == [False] * 4
     assert asleep[-1] == [True] * 4
-    # The contact of a sleeping object with table and kit is not computed.
+    # Contacts of sleeping objects with the table and the kit are not computed.
     results = rig.plant.get_contact_results_output_port().Eval(rig.plant.GetMyContextFromRoot(root))
     assert results.num_hydroelastic_contacts() == 0
 
@@ -244,7 +244,7 @@ def test_a_sleeping_stack_has_no_contacts_until_it_wakes(monkeypatch: pytest.Mon
     assert max(counts) > 12
     assert counts[-1] == 0
     assert all(locked(rig, root))
-    # The highest box, the last one, wakes and touches those that sleep.
+    # Wake the last box, which is the highest, so that it touches the sleeping ones.
     top = len(rig.objects) - 1
     at_rest = rig.station.at_rest(root)
     at_rest[top] = False
@@ -256,11 +256,11 @@ def test_a_sleeping_stack_has_no_contacts_until_it_wakes(monkeypatch: pytest.Mon
 
 
 def test_an_object_that_leaves_the_cell_comes_to_rest(rig: Rig):
-    """A free body that keeps spinning overflows its quaternion in two seconds."""
+    """If it kept spinning as a free body, its quaternion would overflow within two seconds."""
     simulator = rig.station.make_simulator(rig.diagram)
     root = simulator.get_mutable_context()
     context = rig.plant.GetMyMutableContextFromRoot(root)
-    # The oracle handles another object first.
+    # This object is not the one that the oracle picks first.
     flung = rig.plant.get_body(rig.objects[-1].body)
     velocity = SpatialVelocity([0, 0, 4000.0], [300.0, 200.0, 300.0])
     rig.plant.SetFreeBodySpatialVelocity(context, flung, velocity)
@@ -276,12 +276,12 @@ def test_sleep_can_be_switched_off():
     root = advance(rig, 0.6, lambda root: asleep.append(locked(rig, root)))
     assert len(asleep) > 70
     assert not np.any(asleep)
-    assert rig.station.at_rest(root).all()  # The rest detector still reports it.
+    assert rig.station.at_rest(root).all()  # Objects still count as resting.
 
 
 @pytest.mark.slow
 def test_two_runs_of_a_seed_are_bit_identical():
-    """Up to the middle of the first grasp, with objects that fell asleep."""
+    """Compares states in the middle of the first grasp, when other objects sleep."""
 
     def final_state() -> NDArray[np.float64]:
         rig = build(TWINS)
@@ -328,7 +328,7 @@ def test_a_learned_policy_acts_on_the_observation(weights_file: Path):
     assert found == LearnedPolicy(networks, orientations=36, stages=stages)(observation)
     (seen,) = told
     np.testing.assert_array_equal(seen.image, observation.image)
-    # The inputs are unchanged, so the policy is not called again.
+    # As the inputs are unchanged, the policy is not called again.
     assert rig.port("action", context) == found
     assert len(told) == 1
 
@@ -413,7 +413,7 @@ def test_invalid_scenarios_raise(text: str, sentence: str):
 
 @pytest.fixture
 def own_tool(tmp_path: Path) -> Path:
-    """The folder of a tool whose model refers to its own meshes; tests may damage it."""
+    """The folder of a copied tool whose model refers to the meshes beside it."""
     folder = Path(shutil.copytree(MODELS / "tools" / "flat_screwdriver", tmp_path / "mine"))
     sdf = folder / "flat_screwdriver.sdf"
     package = "package://kitting_models/tools/flat_screwdriver/"
@@ -458,7 +458,7 @@ def test_an_invalid_mesh_raises_user_error(own_tool: Path):
 )
 @pytest.mark.usefixtures("rendering", "freed_diagrams")
 def test_unused_stations_are_garbage_collected(policy: PolicyConfig, robot: Robot):
-    """Building stations in a loop does not leak memory."""
+    """Otherwise building stations in a loop would leak memory."""
     scenario = Scenario(
         policy=policy, robot=robot, sensor_noise=SensorNoiseParameters(depth_std=0.001)
     )

@@ -12,8 +12,10 @@ from systems.signals import PixelGrid
 
 SPREAD = 0.3
 OTHER_STREAMS = [stream for stream in range(20) if stream != 13]
-"""Scenes use the streams [seed] and [seed, 1] to [seed, 3]; colours, lights and cameras use others.
-NumPy pads with zeros: [seed, 0] equals [seed]."""
+"""The second numbers of other random streams: masses use [seed, 13].
+
+Scenes use [seed] and [seed, 1] to [seed, 3]; colours, lights and cameras use others. NumPy pads
+seeds with zeros, so [seed, 0] equals [seed]."""
 
 
 @pytest.fixture(scope="module")
@@ -22,7 +24,7 @@ def scene() -> Scene:
 
 
 def mass_factors(scene: Scene, seed: int, spread: float = SPREAD) -> np.ndarray:
-    """The mass factors of a scene of identical objects."""
+    """The factors by which variation changes the masses of a scene's objects, all of 10 g."""
     plant, _ = AddMultibodyPlantSceneGraph(DiagramBuilder(), time_step=0.01)
     objects, _ = add_models(plant, scene, Variation(mass=spread), seed)
     masses = [plant.get_body(item.body).default_mass() for item in objects]

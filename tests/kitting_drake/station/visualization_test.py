@@ -1,4 +1,4 @@
-"""What Meshcat shows before anything moves."""
+"""Meshcat shows the room before the simulation starts."""
 
 from pydrake.geometry import MeshcatParams
 

@@ -13,10 +13,10 @@ def test_separation_is_the_gap_between_polygons():
     square = rectangle(0.02, 0.02)
     assert separation(square, rectangle(0.04, 0.02, x=0.05)) == pytest.approx(0.02)
     assert separation(square, rectangle(0.02, 0.02, x=0.015)) == pytest.approx(-0.005)
-    # A corner points at a side.
+    # The diamond's corner points at a side of the square.
     diamond = rectangle(0.02, 0.02, x=0.03, theta=math.pi / 4)
     assert separation(square, diamond) == pytest.approx(0.02 - 0.01 * math.sqrt(2))
-    # It is at most the distance, here between two corners.
+    # Between corners the separation is less than the distance, which is 14 mm here.
     assert separation(square, rectangle(0.02, 0.02, x=0.03, y=0.03)) == pytest.approx(0.01)
 
 
@@ -38,7 +38,7 @@ def test_the_hand_needs_free_space_at_a_grasp():
     assert not along.is_clear_of(grasped, 0.01)
     assert grasped.is_clear_of(across, 0.01)
     assert not grasped.is_clear_of(across, 0.03)
-    # The palm, 209 mm wide, matters if something is tall.
+    # The palm is 209 mm wide, so a tall object needs more distance.
     beside = ((rectangle(0.02, 0.02),), (), True)
     assert grasped.is_clear_of(Footprint(*beside[:2]).moved(0, 0.09, 0), 0.01)
     assert not grasped.is_clear_of(Footprint(*beside).moved(0, 0.09, 0), 0.01)
@@ -48,6 +48,6 @@ def test_a_workspace_without_free_space_raises():
     footprints = [Footprint((rectangle(0.1, 0.1),))] * 3
     with pytest.raises(UserError, match=r"no free space .* 3 objects"):
         draw_poses(footprints, grid=PixelGrid(rows=40, cols=80), rng=np.random.default_rng(0))
-    # The workspace is beside the table.
+    # No part of this workspace is on the table.
     with pytest.raises(UserError, match="no free space"):
         draw_poses(footprints, grid=PixelGrid(x_min=2.0), rng=np.random.default_rng(0))

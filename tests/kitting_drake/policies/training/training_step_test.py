@@ -53,7 +53,7 @@ def test_a_resumed_run_continues_exactly(decay: bool, stop: bool, monkeypatch: p
     assert found == expected
     assert after.step_count == 4
     assert_same(after, whole)
-    # With a stop network, some of the steps had a final observation, and others had none.
+    # If the networks can stop, some of the steps had a final observation, and others had none.
     assert {"stop" in losses for losses in found} == ({True, False} if stop else {False})
 
 

@@ -32,7 +32,10 @@ def record(scene: Scene, outcome: str, place_error_mm: float = 1.0, tool: int = 
 
 
 def cause(scene: Scene, X_GoalB: RigidTransform, *records: ActionRecord) -> str:
-    """The cause of a tool with this final pose in its goal's frame; the others are kitted."""
+    """The cause of failure of a tool whose final pose in its goal's frame is X_GoalB.
+
+    All other tools are kitted.
+    """
     X_WB = [goal.poses[0] for goal in scene.goals]
     X_WB[TOOL] = X_WB[TOOL] @ X_GoalB
     objects = [
@@ -59,7 +62,7 @@ def test_causes_of_an_object_that_was_never_held(scene: Scene):
 @pytest.mark.parametrize("outcome", ["placed", "dropped"])
 def test_causes_at_its_own_cavity(scene: Scene, outcome: str):
     done = record(scene, outcome)
-    # A later missed grasp of the placed tool does not matter.
+    # If a grasp of the placed tool is missed later, the cause stays the same.
     for records in ([done], [done, record(scene, "missed")]):
         assert cause(scene, flat(0.004, 0.01, 0.2, 0.012), *records) == "insertion blocked"
         assert cause(scene, flat(0.0, 0.0, math.pi - 0.1), *records) == "reversed"

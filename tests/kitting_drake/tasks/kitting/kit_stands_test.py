@@ -1,4 +1,4 @@
-"""Several kits, risers and tilted kits."""
+"""Scenes with several kits, with kits on risers, and with tilted kits."""
 
 import math
 from pathlib import Path
@@ -41,7 +41,7 @@ def test_tools_are_shared_out_between_kits():
         for goal in own:
             place = (fixture.X_WF.inverse() @ goal.poses[0]).translation()
             assert np.abs(place[:2]).max() < 0.14
-    # The two wrenches may swap their cavities, in whichever kits they are.
+    # The two equal wrenches may swap their cavities, even between kits.
     assert sorted(len(goal.objects) for goal in scene.goals) == [1, 1, 2, 2]
 
 
@@ -56,7 +56,7 @@ def test_a_tilted_kit_stands_with_its_lowest_edge_on_its_riser():
         goal = scene.goals[0]
         assert goal.highest is not None and goal.rim_height is not None
         assert goal.highest > goal.rim_height > 0.07
-        # The rim is on the plane of the block's top.
+        # The rim is in the plane of the block's tilted top.
         top = kit.X_WF @ np.array([0.0, 0.0, KitParameters().height])
         middle = goal.poses[0].translation()
         distance = (np.array([middle[0], middle[1], goal.rim_height]) - top) @ up

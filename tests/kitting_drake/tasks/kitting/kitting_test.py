@@ -58,7 +58,7 @@ def test_the_seed_determines_the_scene():
 
 
 def test_poses_and_goals_follow_the_order():
-    """Each tool keeps its own pose and cavity in any order."""
+    """If the order is random, each tool still has the pose and the cavity of the listed order."""
     scene, listed = draw(0), draw(0, Kitting(random_order=False))
     assert names(listed) == Kitting().tools
     assert names(scene) != Kitting().tools
@@ -70,7 +70,7 @@ def test_poses_and_goals_follow_the_order():
         ((X_WGoal,), (expected,)) = goal.poses, listed.goals[there].poses
         assert item.X_WB.IsExactlyEqualTo(listed.objects[there].X_WB)
         assert X_WGoal.IsExactlyEqualTo(expected)
-        # The goal is flush with the rim and aligned with the kit.
+        # At its goal, a tool is flush with the cavity's rim and aligned with the kit.
         tool = load_tool(item.name)
         assert (item.category, item.symmetry) == (tool.category, tool.symmetry)
         assert X_WGoal.translation()[2] + tool.height == pytest.approx(goal.rim_height)
@@ -83,7 +83,7 @@ def test_cavities_may_be_made_for_other_tools():
     (goal,) = draw(0, task).goals
     (model,) = draw(0, Kitting(tools=task.cavities, yaw_range_deg=0.0)).goals
     moved = goal.poses[0].translation() - model.poses[0].translation()
-    # The smaller bracket has its place within the larger one's cavity.
+    # The smaller bracket's goal is moved within the larger bracket's cavity.
     assert 0.0 < np.linalg.norm(moved) < 2e-3
     with pytest.raises(ValueError, match=r"task\.cavities names 1 tools, but must name"):
         Kitting(cavities=["claw_hammer"]).validate()
@@ -95,7 +95,7 @@ def test_tools_at_their_goals_earn_the_whole_reward():
     done = placements(scene, [goal.poses[0] for goal in scene.goals])
     assert all(item.strict_success for item in done)
     assert total_reward(scene.goals, done) == pytest.approx(1.0)
-    # The task's threshold applies.
+    # Success depends on the task's threshold.
     off = [RigidTransform([0.003, 0, 0]) @ goal.poses[0] for goal in scene.goals]
     assert total_reward(scene.goals, placements(scene, off)) == pytest.approx(1.0)
     strict = draw(1, Kitting(success_threshold=0.0005))
@@ -119,7 +119,7 @@ def test_identical_tools_fill_each_others_cavities():
         assert (done[one].goal, done[other].goal) == goals
         assert all(item.success for item in done)
         assert total_reward(scene.goals, done) == pytest.approx(1.0)
-    # Both tools in one cavity fill one goal.
+    # If both tools are in one cavity, only one goal counts as filled.
     both = list(own)
     both[other] = own[one]
     assert total_reward(scene.goals, placements(scene, both)) == pytest.approx(2 / 3)
@@ -135,7 +135,7 @@ def test_identical_tools_have_distinct_names():
     "count", [1, 2, *(pytest.param(many, marks=pytest.mark.slow) for many in (7, 12))]
 )
 def test_kits_of_any_number_of_tools(count: int):
-    # Include all categories, some repeatedly.
+    # With twelve tools, all categories occur, some of them repeatedly.
     tools = tool_names()[:: len(tool_names()) // 12][:count]
     scene = draw(0, Kitting(tools=tools))
     assert sorted(names(scene)) == sorted(tools)
@@ -193,7 +193,7 @@ def test_tools_scaled_too_wide_for_the_jaws_raise(tmp_path: Path):
     shutil.copytree(MODELS / "tools" / "stubby_screwdriver", folder)
     tool = load_tool(str(folder))
     record = yaml.safe_load((folder / "tool.yaml").read_text())
-    # At a length of 0.2 m its grasp is as wide as the open jaws.
+    # Scaled to a length of 0.2 m, the tool's grasp is as wide as the open jaws.
     record["grasp"]["width"] = 0.08 * tool.length / 0.2
     (folder / "tool.yaml").write_text(yaml.safe_dump(record))
     draw(0, ToolsetKitting(pool=[str(folder)], tool_length=[0.15, 0.19]))
@@ -211,7 +211,7 @@ def test_lengths_are_drawn_only_with_random_lengths():
     as_made = lengths(random_lengths=False)
     for name, length in as_made.items():
         assert length == pytest.approx(load_tool(name).length, rel=0.02)
-    # The seed draws the same tools with and without random lengths.
+    # The seed gives the same tools with and without random lengths.
     assert scaled.keys() == as_made.keys()
     assert scaled != as_made
 

@@ -43,7 +43,7 @@ def placed(shape: CrossSection, X: RigidTransform) -> CrossSection:
 
 
 def hand(tool: Tool, size: tuple[float, float]) -> CrossSection:
-    """The area of a rectangle of the hand at a tool's grasp, in the tool's frame."""
+    """A rectangle that stands for the hand, of the given size, at a tool's grasp, in its frame."""
     grasp = tool.grasp
     rectangle = CrossSection.square(size, True).rotate(float(np.rad2deg(grasp.theta)))
     return rectangle.translate((grasp.x, grasp.y))

@@ -1,4 +1,4 @@
-"""Scenes and measures of assembling-kits, without physics."""
+"""Scenes and measures of success of assembling-kits, without physics."""
 
 import dataclasses
 import math
@@ -28,14 +28,14 @@ from tests.kitting_drake.rig import build_rig
 
 
 def write_prism(path: Path, outline: CrossSection) -> None:
-    """In Ravens' units: 3 mm in x and y, 1 mm in z."""
+    """Writes a prism in Ravens' units, which are 3 mm in x and y and 1 mm in z."""
     vertices, faces = vertices_and_faces(outline.extrude(20.0))
     trimesh.Trimesh(vertices, faces, process=False).export(path)
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """Two shapes: a triangle and a disc."""
+    """A folder with two shapes: a triangle and a disc."""
     path = tmp_path_factory.mktemp("shapes")
     write_prism(path / "triangle.obj", CrossSection.circle(11.0, 3))
     write_prism(path / "disc.obj", CrossSection.circle(9.0, 96))
@@ -50,7 +50,10 @@ def make_scene(task: AssemblingKits, seed: int = 0) -> Scene:
 
 
 def measured(scene: Scene, index: int, offset: RigidTransform) -> dict[str, bool]:
-    """The measures of an object at an offset from its goal; `task` is the task's own."""
+    """By measure, whether an object succeeds at an offset from its goal.
+
+    The task's own measure is `task`.
+    """
     goal = next(goal for goal in scene.goals if index in goal.objects)
     item = scene.objects[index]
     placed = PlacedObject(item.name, BodyIndex(0), item.p_BPoints, item.symmetry, item.axis)
@@ -62,7 +65,7 @@ def measured(scene: Scene, index: int, offset: RigidTransform) -> dict[str, bool
 
 
 def turned(scene: Scene, index: int, angle_deg: float, z: float = 0.0) -> RigidTransform:
-    """A rotation about the object's axis of symmetry."""
+    """A rotation about the object's axis of symmetry, and a shift along it by `z` (m)."""
     x, y = scene.objects[index].axis or (0.0, 0.0)
     R = RollPitchYaw(0, 0, math.radians(angle_deg))
     return RigidTransform([x, y, z]) @ RigidTransform(R, [0, 0, 0]) @ RigidTransform([-x, -y, 0.0])
@@ -96,10 +99,10 @@ def test_measures(folder: Path):
         return {name for name, success in measured(scene, index, offset).items() if success}
 
     assert passed(RigidTransform()) == every
-    # A third of a turn is the same place.
+    # The shape is symmetric under a third of a turn.
     assert passed(turned(scene, index, 120.0)) == every
     assert passed(turned(scene, index, 60.0)) == set()
-    # ManiSkill compares headings more strictly, and heights; Ravens no heights.
+    # ManiSkill is stricter about headings and compares heights; Ravens ignores heights.
     assert passed(turned(scene, index, 8.0)) == every - {"maniskill"}
     assert passed(turned(scene, index, 0.0, 0.0025)) == every - {"strict"}
     assert passed(turned(scene, index, 0.0, 0.02)) == {"ravens", "task"}

@@ -1,4 +1,4 @@
-"""The expert executes the Ravens tasks with real physics."""
+"""The expert solves the Ravens tasks in simulated episodes."""
 
 import pytest
 

@@ -50,7 +50,7 @@ def reward(scene: Scene, poses: Sequence[RigidTransform]) -> float:
 
 
 def moved(X_WB: RigidTransform, *, x: float = 0.0, z: float = 0.0, yaw_deg: float = 0.0):
-    """Rotated about its own origin, then moved along world x and z."""
+    """A pose that is rotated about its own origin, then moved along the world's x and z."""
     rotation = RigidTransform(RollPitchYaw(0, 0, math.radians(yaw_deg)), [0, 0, 0])
     return RigidTransform([x, 0, z]) @ X_WB @ rotation
 
@@ -64,7 +64,7 @@ def test_success_is_within_10_mm_and_15_degrees(kind: type[TaskConfig]):
         assert reward(scene, [moved(X_WGoal, x=0.009, z=0.02)]) == 1
         assert reward(scene, [moved(X_WGoal, x=0.011)]) == 0
     (X_WGoal, *_) = scene.goals[0].poses
-    # The L-block's middle is off the origin about which it is rotated here.
+    # Rotating the L-block about its origin moves its middle, so only 10 degrees are tried there.
     assert reward(scene, [moved(X_WGoal, yaw_deg=14 if kind is AlignBoxCorner else 10)]) == 1
     assert reward(scene, [moved(X_WGoal, yaw_deg=16)]) == 0
 
@@ -95,7 +95,7 @@ def test_each_red_cube_in_a_green_bowl_earns_its_share():
     assert reward(scene, poses) == pytest.approx(1 / 3)
     poses[1] = moved(bowls[1], x=-0.049)
     assert reward(scene, poses) == pytest.approx(2 / 3)
-    # Two cubes in one bowl also count.
+    # Two cubes in one bowl both count.
     poses[2] = moved(bowls[1], x=0.03)
     assert reward(scene, poses) == pytest.approx(1)
     poses[2] = moved(bowls[1], x=0.051)
@@ -112,13 +112,13 @@ def test_a_pyramid_counts_row_by_row():
     assert reward(scene, start) == 0
     for done, expected in enumerate([0, 1 / 6, 2 / 6, 3 / 6, 4 / 6, 5 / 6, 1]):
         assert reward(scene, places[:done] + start[done:]) == pytest.approx(expected)
-    # Cubes of a row are interchangeable, and symmetric under quarter rotations.
+    # The cubes of a row are interchangeable, and each may be turned by 90 degrees.
     exchanged = [places[2], moved(places[0], yaw_deg=90), places[1], *places[3:]]
     assert reward(scene, exchanged) == pytest.approx(1)
-    # A cube of another row does not count.
+    # A cube in another row than its own does not count.
     wrong = [places[5], *places[1:5], places[0]]
     assert reward(scene, wrong) == pytest.approx(2 / 6)
-    # Cubes above an incomplete row do not count.
+    # Cubes in rows above an incomplete row do not count.
     assert reward(scene, [start[0], *places[1:]]) == pytest.approx(2 / 6)
 
 
@@ -134,15 +134,15 @@ def test_boxes_earn_the_share_of_their_volume_in_the_zone():
     start = initial_poses(scene)
     assert reward(scene, start) == 0
     assert reward(scene, places) == pytest.approx(1)
-    # Each box counts separately, anywhere in the zone.
+    # Each box counts by itself, wherever it is in the zone.
     assert reward(scene, [*start[:17], places[17]]) == pytest.approx(1 / 18)
     tilted = RigidTransform(RollPitchYaw(0.4, 0.3, 0.2), [0.45, 0.25, 0.15])
     assert reward(scene, [tilted, *start[1:]]) == pytest.approx(1 / 18)
-    # A box counts partially: two of five rows of points are beyond the zone's edge at x = 0.65.
+    # Two of the box's five rows of points are beyond the zone's edge at x = 0.65: 3/5 counts.
     over_the_edge = RigidTransform([0.645, 0.25, 0.04])
     assert reward(scene, [over_the_edge, *start[1:]]) == pytest.approx(3 / 5 / 18)
     assert reward(scene, [moved(over_the_edge, x=0.05), *start[1:]]) == 0
-    # Nothing counts above 0.30 m.
+    # Points above 0.30 m do not count.
     assert reward(scene, [moved(places[0], z=0.30), *start[1:]]) == 0
 
 

@@ -1,4 +1,4 @@
-"""Tests of the Ravens scenes with the collision geometry of the plant."""
+"""The Ravens scenes, tested with the plant's collision geometry."""
 
 import dataclasses
 import functools
@@ -47,10 +47,10 @@ def shared_cell(kind: type[TaskConfig], seed: int) -> Rig:
 
 
 class Posed:
-    """A scene whose objects and hand are posed by the test.
+    """A scene in which a test poses the objects and the hand.
 
-    Objects float above their supports, the upper ones higher. Resting objects therefore do not
-    touch, and every contact is an error.
+    Objects float a little above their supports, and upper ones higher, so that resting objects do
+    not touch each other. Every contact is therefore an error.
     """
 
     def __init__(self, kind: type[TaskConfig], seed: int) -> None:
@@ -76,7 +76,7 @@ class Posed:
         self.put(index, RigidTransform([index, 3.0, 1.0]))
 
     def put_hand(self, index: int, grasp: Grasp, opening: float) -> None:
-        """Puts the hand at a grasp, at the greatest grasp depth, with an opening in m."""
+        """Puts the hand at an object's grasp, at the greatest grasp depth; `opening` is in m."""
         gripper = gripper_pose(self.poses[index], grasp)
         z = self.poses[index].translation()[2] + grasp.surface_height
         z -= PickPlaceParameters().max_grasp_depth
@@ -135,7 +135,7 @@ def test_all_objects_are_in_the_workspace(kind: type[TaskConfig]):
 @each_task
 @pytest.mark.parametrize("seed", SEEDS)
 def test_objects_are_free_and_reachable(kind: type[TaskConfig], seed: int):
-    """Initially nothing touches. Objects are taken from the top, by any of their grasps."""
+    """Nothing touches at first, and from the top down, the open hand fits at all grasps."""
     posed = Posed(kind, seed)
     assert posed.contacts() == set()
     opening = PickPlaceParameters().open_width
@@ -154,7 +154,7 @@ def test_objects_are_free_and_reachable(kind: type[TaskConfig], seed: int):
 @each_task
 @pytest.mark.parametrize("seed", SEEDS)
 def test_goals_are_free_and_reachable(kind: type[TaskConfig], seed: int):
-    """Goals are filled in order, by a hand that opens to release."""
+    """If goals are filled in order, the hand has room to open there."""
     posed = Posed(kind, seed)
     filled: set[int] = set()
     taken: list[np.ndarray] = []
@@ -175,7 +175,7 @@ def test_goals_are_free_and_reachable(kind: type[TaskConfig], seed: int):
 
 @each_task
 def test_objects_come_to_rest_at_once(kind: type[TaskConfig]):
-    """Light and stiff boxes must not chatter on the table, or they never sleep."""
+    """Light and stiff boxes must not chatter on the table, or they would never sleep."""
     rig = shared_cell(kind, 1)
     simulator = rig.station.make_simulator(rig.diagram)
     simulator.AdvanceTo(0.4)
@@ -187,7 +187,7 @@ def test_objects_come_to_rest_at_once(kind: type[TaskConfig]):
 
 @pytest.mark.parametrize("sleeps", [True, False])
 def test_boxes_appear_one_at_a_time(sleeps: bool):
-    """The second appears when the first is on the pallet; then the third still waits."""
+    """The second box appears when the first is on the pallet; the third still waits."""
     scenario = Scenario(
         task=PalletizingBoxes(),
         cameras={},
@@ -211,7 +211,7 @@ def test_boxes_appear_one_at_a_time(sleeps: bool):
 
 
 def test_surface_points_span_the_object():
-    """Positions are compared at the middle of the points' bounding box."""
+    """They must reach its ends, because positions are compared at the middle of their bounds."""
     block = make_scene(BlockInsertion(), 0).objects[0]
     np.testing.assert_allclose(block.p_BPoints.min(axis=0), [-0.015, -0.015, 0], atol=1e-12)
     np.testing.assert_allclose(block.p_BPoints.max(axis=0), [0.065, 0.065, 0.04], atol=1e-12)
