@@ -1,4 +1,4 @@
-"""The cells of docs/tutorial.ipynb run, one after another, and it stores no outputs."""
+"""The cells of docs/tutorial.ipynb run one after another, and the notebook stores no outputs."""
 
 import json
 import os
@@ -41,7 +41,7 @@ def test_the_cells_run_in_a_folder_outside_the_tree(
     matplotlib.use("Agg")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    # The notebook starts `python -m kitting_drake.hkd` too.
+    # The notebook also runs `python -m kitting_drake.hkd`, which must find this checkout.
     tree = str(NOTEBOOK.parents[1])
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([tree, os.environ.get("PYTHONPATH", "")]))
     names: dict[str, Any] = {"__name__": "__main__"}

@@ -1,4 +1,4 @@
-"""Tests the sources of the site that `make docs` builds."""
+"""Tests the sources of the website that `make docs` builds."""
 
 import re
 from pathlib import Path

@@ -43,14 +43,14 @@ def plan(
 )
 def test_the_whole_action_keeps_all_limits(model: str, action: PickPlaceAction, rate: int):
     trajectory, limits = plan(model, action, rate), ARM_LIMITS[model]
-    # As a controller would interpolate it, at 1 kHz.
+    # Sample the trajectory at 1 kHz, as a controller would interpolate it.
     samples = np.array([trajectory.at(k / 1000) for k in range(int(1000 * trajectory.duration))])
     for name, share in limits_used(samples, limits, 1000):
         assert share <= (1.0 if rate == 1000 else 1.02), name
     assert all(share <= 1.0 for _, share in trajectory.limits_used)
     q, v, a = trajectory.positions, trajectory.velocities, trajectory.accelerations
     np.testing.assert_array_equal([v[0], a[0], v[-1], a[-1]], 0.0)
-    # Velocities and accelerations are derivatives of the positions.
+    # Velocities and accelerations must be derivatives of the positions.
     step = 1 / rate
     np.testing.assert_allclose(np.diff(q, axis=0), step * (v[1:] + v[:-1]) / 2, atol=1e-5)
     np.testing.assert_allclose(np.diff(v, axis=0), step * (a[1:] + a[:-1]) / 2, atol=2e-3)
@@ -62,7 +62,7 @@ def test_the_hand_is_where_the_action_says():
         it.mode: motion.postures.hand_pose(trajectory.positions[it.last])
         for it in trajectory.segments
     }
-    # The fingertips grip 10 mm below the top. At the place they stop at the cavity's rim.
+    # At the pick the fingertips go 10 mm below the object's top, at the place to the cavity's rim.
     np.testing.assert_allclose(ends["DESCEND"][:3], [0.45, 0.2, 0.01], atol=1e-3)
     np.testing.assert_allclose(ends["LOWER"][:3], [0.55, -0.1, 0.05], atol=1e-3)
     turned = ends["LOWER"][3] - ends["DESCEND"][3]
@@ -75,7 +75,7 @@ def test_the_object_is_lowered_to_the_floor_where_the_fingers_have_room():
     shallow = dataclasses.replace(SURFACES, place_rim=0.035)
     trajectory, motion = plan(surfaces=shallow), ArmMotion(PARAMETERS, FR3, ArmBase())
     end = next(it.last for it in trajectory.segments if it.mode == "LOWER")
-    # The fingertips hold the object 10 mm above its bottom, which stands on the place's floor.
+    # The object stands on the place's floor; the fingertips hold it 10 mm above its bottom.
     assert motion.postures.hand_pose(trajectory.positions[end])[2] == pytest.approx(0.04, abs=1e-3)
 
 
@@ -93,7 +93,7 @@ def test_segments_and_jaws():
         (starts["CLOSE"], 0.0, 30.0),
         (starts["RELEASE"], 0.08, 0.0),
     ]
-    # The arm waits for jaws that close, and for jaws that open, all the way.
+    # The arm waits until the jaws have closed or opened all the way.
     assert trajectory.width_at(starts["CLOSE"] + 0.4) == pytest.approx((0.04, -0.1))
     assert trajectory.width_at(starts["CHECK"])[0] == pytest.approx(0.0)
     assert trajectory.width_at(starts["RETREAT"] + 0.01) == pytest.approx((0.08, 0.0))
@@ -106,7 +106,7 @@ def test_segments_and_jaws():
         ("RETREAT", None),
     ]
     assert pressed.width_at(pressed.duration)[0] == 0.0
-    # The press would go on to 20 mm below the top, which is the table.
+    # A press may end 20 mm below the object's top. Here that is the table, so it ends above it.
     motion = ArmMotion(PARAMETERS, FR3, ArmBase())
     lowest = motion.postures.hand_pose(pressed.positions[pressed.segments[1].last])[2]
     assert lowest == pytest.approx(PARAMETERS.floor_clearance, abs=1e-4)

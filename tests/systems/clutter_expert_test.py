@@ -20,7 +20,7 @@ RIM = 0.05
 
 
 def box_points(length: float, width: float, height: float, spacing: float = 0.004) -> np.ndarray:
-    """Points on the surface of a box that stands on its origin."""
+    """Points on the surface of a box whose origin is the middle of its bottom."""
     x, y, z = (
         np.linspace(low, high, max(2, round((high - low) / spacing) + 1))
         for low, high in ((-length / 2, length / 2), (-width / 2, width / 2), (0, height))
@@ -32,7 +32,7 @@ def box_points(length: float, width: float, height: float, spacing: float = 0.00
 
 
 def wedge_points() -> np.ndarray:
-    """A bar with a cross-piece on one side, whose outline is not its own mirror image."""
+    """Points on a bar with a block beside one end, whose outline is not its own mirror image."""
     return np.concatenate(
         [box_points(0.18, 0.02, 0.012), box_points(0.03, 0.03, 0.012) + (0.07, 0.025, 0)]
     )
@@ -80,7 +80,7 @@ def test_a_tool_under_another_waits():
     action = clutter.aside([0, 1])
     assert action is not None and action.aside
     assert action.pick.theta % math.pi == pytest.approx(math.pi / 2)
-    # On the table, clear of the other tool and the kit.
+    # The place is on the table, clear of the other tool and the kit.
     away = np.hypot(action.place.x - 0.5, action.place.y - 0.2)
     assert away > 0.1 and action.place.y > -0.1
 
@@ -93,7 +93,7 @@ def test_a_tilted_tool_is_laid_aside():
 
 
 def test_a_tool_between_others_is_gripped_where_it_is_free():
-    # The other tool lies beside the first two grasps.
+    # The other tool leaves no room for the fingers at the first two grasps.
     clutter = expert(pose(0.5, 0.2), pose(0.6, 0.155, math.pi))
     assert to_goal(clutter) is None
     action = clutter.aside([0])
@@ -113,7 +113,7 @@ def test_a_tool_the_wrong_way_up_is_turned_over_the_block():
     assert to_goal(clutter) is None
     action = clutter.aside([0])
     assert action is not None and action.aside
-    # It is let go along an edge of the block, near a corner.
+    # The place is near an edge of the block.
     at = np.abs((KIT.inverse() @ [action.place.x, action.place.y, 0.0])[:2]) - (0.14, 0.13)
     assert np.abs(at).min() < 0.015
 
@@ -133,7 +133,7 @@ def test_the_hand_keeps_clear():
 
     assert count(0.5, 0.03, 0.02) and not count(0.5, 0.03, 0.005)
     assert not count(0.5, 0.005, 0.02) and not count(0.52, 0.03, 0.02)
-    # Fingers are thicker above their tips, and the palm is wider.
+    # Above their tips the fingers are thicker, and higher up the palm is wider.
     assert count(0.5, 0.06, 0.04) and not count(0.5, 0.06, 0.02)
     assert count(0.52, 0.09, 0.08) and not count(0.52, 0.09, 0.04)
 

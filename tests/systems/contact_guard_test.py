@@ -10,7 +10,7 @@ GRAVITY = 9.81
 
 
 class Hand:
-    """A guard and the state that it watches."""
+    """A guard and the planner's state, to which tests feed contact forces."""
 
     def __init__(self, mode: Mode, *, payload: float = 0.0) -> None:
         self.guard = ContactGuard(30.0, STEP)
@@ -46,7 +46,7 @@ def test_a_load_is_known_as_it_is_lifted_but_no_more_than_the_hand_can_carry():
     assert known_payload(hand.state) == pytest.approx(-3.0 * GRAVITY)
     hand.feel((0, 0, -10.0))
     hand.state.mode = Mode.CARRY
-    # It is the last one felt until enough samples are weighed.
+    # Until enough samples are weighed, the payload is the last one that was felt.
     hand.feel((0, 0, -12.0), times=2)
     assert known_payload(hand.state) == -10.0
     hand.feel((0, 0, -12.0), times=20)
@@ -62,7 +62,7 @@ def test_contact_below_the_travel_height_is_not_weighed():
     hand.feel((0, 0, 15.0), height=0.05, times=2)
     assert hand.state.payload == pytest.approx(-5.0)
     assert hand.state.peak_vertical == pytest.approx(20.0)
-    # Nor is it tared.
+    # A tare during such a contact does not change the payload either.
     hand.guard.tare(hand.state, np.array([0, 0, 15.0, 0, 0, 0]), 4.0)
     assert hand.state.payload == pytest.approx(-5.0)
     hand.guard.tare(hand.state, np.array([0, 0, -5.5, 0, 0, 0]), 4.0)
@@ -88,7 +88,7 @@ def test_a_press_is_limited_by_its_own_force():
 def test_a_rising_hand_may_be_pushed_but_not_held():
     assert not Hand(Mode.RETREAT).feel((0, 0, 50.0), times=10)
     assert Hand(Mode.RETREAT).feel((0, 0, -50.0), times=3)
-    # A lifted object may weigh up to 3 kg.
+    # While an object is lifted, a force of up to 3 kg is its weight, not a contact.
     assert not Hand(Mode.LIFT).feel((0, 0, -29.0), times=10)
     assert Hand(Mode.LIFT).feel((0, 0, -29.0 - 31.0), times=3)
 

@@ -48,10 +48,10 @@ def test_travel_is_time_optimal_up_to_smoothing(distance):
     assert (np.diff(position) >= 0).all()
     assert velocity.max() <= 0.6 + 1e-9
     assert abs(acceleration).max() <= 3.0 + 1e-9
-    # Without smoothing, the fastest velocity profile is a trapezoid or a triangle.
+    # The duration of the fastest velocity profile without smoothing, a trapezoid or a triangle.
     trapezoid = max(2 * np.sqrt(distance / 3.0), distance / 0.6 + 0.6 / 3.0)
     assert times[-1] <= trapezoid + SMOOTHING + 1e-9
-    # Worst case: the acceleration reverses at the middle of a short travel.
+    # The jerk is largest where the acceleration reverses, at the middle of a short travel.
     assert abs(np.diff(acceleration) / np.diff(times)).max() <= 2 * 3.0 / SMOOTHING * (1 + 1e-6)
 
 
@@ -88,7 +88,7 @@ def test_braking_never_reverses_and_keeps_the_limits():
     ("pick", "place", "present", "expected"),
     [
         (0.1, 0.4, 0.0, (0.1, 0.4)),
-        (3.0, -3.0, 0.0, (3.0 - np.pi, np.pi - 3.0)),  # 8 degrees each way, not 172.
+        (3.0, -3.0, 0.0, (3.0 - np.pi, np.pi - 3.0)),  # Both turn by 8 degrees, not by 172.
         (3.0, -3.0, 2.9, (3.0, 2 * np.pi - 3.0)),  # A yaw beyond pi can be nearer.
         (0.2, 0.2 + np.pi, 0.0, None),  # A half rotation of the object is not skipped.
         (5.0, 11.0, 1.0, None),
@@ -101,12 +101,12 @@ def test_shortest_yaws(pick, place, present, expected):
     if expected is not None:
         np.testing.assert_allclose(rotated, expected)
     assert max(map(abs, rotated)) <= limit
-    # The same grasp and the same rotation of the object.
+    # The yaws give the same grasp and the same rotation of the object as the given ones.
     half_turns = (rotated[0] - pick) / np.pi
     assert half_turns == pytest.approx(round(half_turns))
     turns = ((rotated[1] - rotated[0]) - (place - pick)) / (2 * np.pi)
     assert turns == pytest.approx(round(turns))
-    # No equivalent pair within the limit rotates less.
+    # No equivalent pair of yaws within the limit makes the hand turn less.
     ways = [
         abs(a - present) + abs(b - a)
         for half in (0, 1)

@@ -26,7 +26,7 @@ needs_renderer = pytest.mark.skipif(
 OUTPUTS = ("color_image", "depth_image_32f", "body_pose_in_world")
 INPUTS = ("color_image", "depth_image", "body_pose_in_world")
 
-# A rendered scene: a box on a table under the three cameras of Ravens.
+# The first tests use a rendered scene: a box on a table under the three cameras of Ravens.
 
 BOX = np.array([0.10, 0.06, 0.04])
 BOX_COLOR = np.array([0.8, 0.3, 0.1])
@@ -40,7 +40,7 @@ GRID = PixelGrid()
 
 
 class _Scene:
-    """A box on the table seen by the cameras, each mounted in its sensor body by another pose."""
+    """A box on a table, seen by cameras, each with another pose in its sensor body."""
 
     def __init__(self):
         builder = DiagramBuilder()
@@ -94,8 +94,10 @@ CORNERS = np.array([(-0.5, -0.5), (-0.5, 0.5), (0.5, -0.5), (0.5, 0.5)])
 
 
 def _cells_against_box(X_WBox):
-    """Which pixel squares lie inside the box's footprint, and which do not touch it (separating
-    axis theorem with a margin of 0.3 mm)."""
+    """Two masks: pixels that lie inside the box's footprint, and pixels that do not touch it.
+
+    The latter are found by the separating axis theorem, with a margin of 0.3 mm.
+    """
     offset_W = GRID.to_world(PIXELS) - X_WBox.translation()[:2]
     R = X_WBox.rotation().matrix()[:2, :2]
     offset_Box = offset_W @ R
@@ -144,7 +146,7 @@ def test_heightmap_shows_the_box_at_its_true_pose(scene, xy, yaw_deg):
     assert np.max(np.abs(lit_xy.mean(axis=0) - xy)) < 0.5 * GRID.resolution
     _, axes = np.linalg.eigh(np.cov(lit_xy.T))
     angle = math.degrees(math.atan2(axes[1, 1], axes[0, 1]))
-    assert abs(math.remainder(angle - yaw_deg, 180)) < 1.5  # One pixel over the length is 1.8.
+    assert abs(math.remainder(angle - yaw_deg, 180)) < 1.5  # One pixel over its length is 1.8.
 
     # Shading scales a colour but keeps its hue. At outlines the renderer blends the two.
     blank = np.all(observation.image == 0, axis=0)
@@ -155,7 +157,7 @@ def test_heightmap_shows_the_box_at_its_true_pose(scene, xy, yaw_deg):
         assert np.quantile(np.abs(hue - color / color.sum()), 0.999) < 0.01
         assert 0.5 < seen.max() / color.max() <= 1.01
 
-    # Fully visible surfaces are seen, save for stray gaps.
+    # Of the surfaces that are fully visible to a camera, at most one pixel is blank.
     squares = PIXELS[:, :, None] + CORNERS
     visible = np.zeros(GRID.shape, bool)
     for camera in CAMERAS:
@@ -174,8 +176,8 @@ def test_hidden_pixels_are_zero_with_one_camera(scene):
     _fix(projector, context, "eye", color.data, depth.data[:, :, 0], X_WB)
     image = projector.GetOutputPort("observation").Eval(context).image
 
-    # The shadow of the box on the table is convex: it contains a square of three pixels if it
-    # contains its corners.
+    # The shadow of the box on the table is convex, so it contains a square of 3 x 3 pixels if it
+    # contains the square's corners.
     squares = PIXELS[:, :, None] + 3 * CORNERS
     in_shadow = np.all(_is_hidden(X_WBox, "left", squares), axis=-1)
     in_shadow &= _cells_against_box(X_WBox)[1]
@@ -183,8 +185,9 @@ def test_hidden_pixels_are_zero_with_one_camera(scene):
     assert not np.any(image[:, in_shadow])
 
 
-# By hand: a 5x4 image from one metre above a grid of 4 rows and 5 columns. At depth 1 the image's
-# pixels coincide with the grid's; at depth 1/2 their distances are halved.
+# The other tests use hand-made images of 5 x 4 pixels, seen from 1 m above a grid of 4 rows and
+# 5 columns. At depth 1 the image's pixels coincide with the grid's; at depth 1/2 they are half as
+# far apart.
 
 SMALL = PixelGrid(x_min=0, y_min=0, resolution=0.1, rows=4, cols=5, z_max=0.6)
 X_WD = RigidTransform(RotationMatrix([[0, 1, 0], [1, 0, 0], [0, 0, -1]]), [0.2, 0.25, 1])
@@ -220,7 +223,7 @@ def _small_projector(*names, grid=SMALL):
 
 
 def _project(*views, grid=SMALL):
-    """The observation's image from (color, depth) of several cameras."""
+    """The image of the observation that is projected from (color, depth) of several cameras."""
     names = [f"camera{i}" for i in range(len(views))]
     projector, context = _small_projector(*names, grid=grid)
     for name, (color, depth) in zip(names, views, strict=True):
@@ -248,7 +251,7 @@ def test_flat_ground_reproduces_the_camera_image():
 
 def test_each_pixel_takes_height_and_color_of_its_highest_point():
     depth = FLAT.copy()
-    depth[0, 0] = 0.5  # Seen at x = 0.2 - 0.075, y = 0.25 - 0.1: over pixel (1, 1).
+    depth[0, 0] = 0.5  # At x = 0.2 - 0.075, y = 0.25 - 0.1, in grid pixel (1, 1).
     image = _project((COLOR, depth))
     np.testing.assert_allclose(image[:, 1, 1], [*RGB[0, 0], 0.5], atol=1e-6)
     np.testing.assert_array_equal(image[:, 0, 0], 0)
@@ -263,7 +266,7 @@ def test_depths_out_of_range_are_ignored(out):
 
 def test_points_above_the_workspace_are_dropped_and_below_it_read_as_zero():
     depth = FLAT.copy()
-    depth[1, 2], depth[2, 2] = 0.3, 1.2  # Heights 0.7, above z_max, and -0.2.
+    depth[1, 2], depth[2, 2] = 0.3, 1.2  # The heights are 0.7, above z_max, and -0.2.
     image = _project((COLOR, depth))
     np.testing.assert_allclose(image[:, 1, 2], [*(RGB[1, 1] + RGB[1, 3]) / 2, 0], atol=1e-6)
     np.testing.assert_allclose(image[:, 2, 2], [*RGB[2, 2], 0], atol=1e-6)
@@ -275,7 +278,7 @@ def test_only_gaps_of_one_pixel_within_one_surface_are_filled():
     np.testing.assert_array_equal(_project((COLOR, hole))[:, 1:3, 1:3], 0)
     step[1, 2], step[1, 1], step[0, 2] = 0, 0.98, 0.98
     np.testing.assert_array_equal(_project((COLOR, step))[:, 1, 2], 0)
-    ridge[1, 2], ridge[0, 2], ridge[2, 2] = 0, 0.98, 0.98  # Between level ground.
+    ridge[1, 2], ridge[0, 2], ridge[2, 2] = 0, 0.98, 0.98  # A gap in a ridge.
     bridged = (RGB[0, 2] + RGB[2, 2]) / 2
     np.testing.assert_allclose(_project((COLOR, ridge))[:, 1, 2], [*bridged, 0.02], atol=1e-6)
 
@@ -283,7 +286,7 @@ def test_only_gaps_of_one_pixel_within_one_surface_are_filled():
 @pytest.mark.parametrize(("lower", "tints"), [(0.005, True), (0.02, False)])
 def test_only_cameras_that_see_the_top_surface_color_it(lower, tints):
     depth = FLAT.copy()
-    depth[1, 2] -= 0.02  # The pixel in the middle row is a little nearer to one camera.
+    depth[1, 2] -= 0.02  # A surface 20 mm above the table.
     image = _project((COLOR, depth), (2 * COLOR, depth + np.float32(lower)))
     share = 1.5 if tints else 1
     np.testing.assert_allclose(image[:, 1, 2], [*share * RGB[1, 2], 0.02], atol=1e-6)

@@ -1,4 +1,4 @@
-"""o_t from depth images: what is seen, what could be seen, and the level of the table."""
+"""o_t from depth images: which pixels are seen or in view, and how the table is levelled."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ DOWN = np.array([[0.0, -1, 0, 0.5], [-1, 0, 0, 0], [0, 0, -1, 0.9], [0, 0, 0, 1]
 def flat(
     X_WD: np.ndarray = DOWN, *, lowered: float = 0.0, focal: float = 450.0, noise: float = 0.0
 ) -> View:
-    """A camera above a level table with a box of 30 mm; the true table may be lower than z = 0."""
+    """A camera's view of a level table, `lowered` below z = 0, with a box, 30 mm high, on it."""
     rays = DepthRays.from_pinhole(
         size=(640, 480), focal=(focal, focal), centre=(320, 240), depth_range=(0.01, 10)
     )
@@ -34,7 +34,7 @@ def test_pixels_outside_all_images_are_out_of_view():
     seen = project([flat(focal=900.0)], GRID)
     assert 0.1 < seen.in_view.mean() < 0.7
     assert seen.valid[seen.in_view].mean() > 0.99
-    # At an image's edge, the heights of the box itself may be seen beyond.
+    # Pixels count as in view by the table's height; at the image's edge a box may show beyond.
     assert seen.valid[~seen.in_view].mean() < 0.03
     middle = tuple(np.rint(GRID.to_pixel((0.5, 0.0))).astype(int))
     assert seen.in_view[middle]
@@ -55,7 +55,7 @@ def test_a_table_that_is_off_is_levelled(lowered: float):
     assert true.table == (0.0, 0.0, 0.0)
     assert seen.table[2] == pytest.approx(-lowered, abs=5e-4)
     assert np.median(seen.height[seen.height > 0.02]) == pytest.approx(0.03, abs=5e-4)
-    # Motions go down to a lower table, and to the expected one if it looks higher.
+    # Heights for motions follow a table that is lower than expected, but not one that looks higher.
     pick = PlanarPose(0.45, 0.1)
     found = read_surface_heights(seen, pick, pick)
     assert found.pick_top == pytest.approx(0.03 - max(lowered, 0.0), abs=2e-3)
@@ -79,7 +79,7 @@ def test_a_table_far_off_is_not_levelled():
 
 def test_what_no_camera_sees_is_not_filled_from_its_border():
     height = np.zeros((40, 60), np.float32)
-    height[10:20, 25:30] = 0.05  # Ends at the border of the view.
+    height[10:20, 25:30] = 0.05  # An object that ends at the border of the view.
     valid = np.zeros(height.shape, bool)
     valid[:, :30] = True
     height[5:7, 5:7] = np.nan
@@ -87,7 +87,7 @@ def test_what_no_camera_sees_is_not_filled_from_its_border():
     filled = fill_unseen(height, valid, in_view=np.arange(60) < np.full((40, 1), 30))
     assert not filled[:, 30:].any()
     assert not filled[5:7, 5:7].any() and filled[15, 27] == np.float32(0.05)
-    # In a large hole within the view, nothing is drawn far from its border.
+    # A large hole within the view is filled near its border only.
     assert not fill_unseen(height, valid)[:, 56:].any()
 
 
@@ -95,7 +95,7 @@ def test_the_shadow_of_an_object_is_table():
     height = np.zeros((30, 40), np.float32)
     height[10:20, 10:20] = 0.02
     valid = np.ones(height.shape, bool)
-    valid[10:20, 20:26] = False  # The shadow, as wide as six pixels.
+    valid[10:20, 20:26] = False  # The object's shadow is six pixels wide.
     valid[14:16, 13:15] = False  # Pixels without depth on top of the object.
     filled = fill_unseen(np.where(valid, height, 0), valid)
     assert not filled[10:20, 20:26].any()

@@ -11,7 +11,7 @@ PICK = PlanarPose(0.5, 0.1, 0.0)
 
 
 def width(*bars: tuple[float, float, float], pick: PlanarPose = PICK, top: float = 0.02) -> float:
-    """Of bars along x with a middle y, a width and a height."""
+    """`object_width` at the pick, where bars along x have a middle y, a width and a height."""
     y = GRID.to_world(np.stack(np.indices(GRID.shape), -1))[..., 1]
     height = np.zeros(GRID.shape, np.float32)
     for middle, across, tall in bars:
@@ -22,10 +22,10 @@ def width(*bars: tuple[float, float, float], pick: PlanarPose = PICK, top: float
 def test_the_width_is_that_of_the_object_and_at_most_two_pixels_more():
     found = width((0.1, 0.025, 0.02))
     assert 0.025 <= found <= 0.025 + 2.1 * GRID.resolution
-    # The farther side counts.
+    # If the pick is off the middle, the width is twice the distance to the farther side.
     aside = width((0.105, 0.025, 0.02))
     assert 0.035 <= aside <= 0.035 + 2.1 * GRID.resolution
-    # The jaws close along the hand's y.
+    # The jaws close along the hand's y axis, here along the bar, which has no end in sight.
     assert width((0.1, 0.025, 0.02), pick=PlanarPose(0.5, 0.1, math.pi / 2)) == math.inf
 
 
@@ -34,7 +34,7 @@ def test_the_width_is_that_of_the_object_and_at_most_two_pixels_more():
     [
         (),
         ((0.1, 0.09, 0.02),),
-        # Something is where a half-open finger would go down.
+        # A second bar is where a finger would go down if the jaws were half open.
         ((0.1, 0.025, 0.02), (0.13, 0.01, 0.02)),
     ],
 )

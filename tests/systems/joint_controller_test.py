@@ -59,11 +59,11 @@ def test_feedforward_is_mass_matrix_times_acceleration_and_bias(arm: MultibodyPl
     arm.SetPositions(own, np.append(Q, [0.02, 0.021]))
     arm.SetVelocities(own, np.append(V, [-0.01, -0.02]))
     mass = arm.CalcMassMatrix(own)
-    # Reflected inertia of the drives is part of it.
+    # The mass matrix includes the reflected inertia of the drives.
     assert mass[0, 0] > 0.6 and mass[6, 6] > 0.2
     expected = (mass @ np.append(A_D, [0.0, 0.0]) + arm.CalcBiasTerm(own))[:7]
     np.testing.assert_allclose(value(controller, context, "feedforward"), expected, atol=1e-9)
-    # There is no gravity in it.
+    # The arm's model has no gravity.
     at_rest = arm.CalcInverseDynamics(arm.CreateDefaultContext(), np.zeros(9), MultibodyForces(arm))
     np.testing.assert_allclose(at_rest, 0.0, atol=1e-12)
 

@@ -16,7 +16,7 @@ ELSEWHERE = [0.5, 2.0, 0.0]
 
 
 def arriving(positions: dict[int, list[float]], mode: Mode = Mode.OBSERVE) -> float:
-    """The port's value; objects wait unless `positions` (m) sets theirs."""
+    """The value of the port `arriving`; objects wait unless `positions` (m) says where they are."""
     feeder = ObjectFeeder(
         waiting=[(BodyIndex(body), np.array(WAITS[body])) for body in (FIRST, SECOND)],
         others=[BodyIndex(BOWL)],
@@ -39,7 +39,7 @@ def arriving(positions: dict[int, list[float]], mode: Mode = Mode.OBSERVE) -> fl
         ({FIRST: [0.5, 0.5, 0.0]}, -1),
         ({BOWL: [0.5, 0.5, 0.0]}, -1),
         ({FIRST: ELSEWHERE, SECOND: ELSEWHERE}, -1),
-        # An object that fell off the table does not come back.
+        # An object that fell off the table is not waited for: the next one arrives.
         ({FIRST: [0.5, 2.0, -40.0]}, 1),
         ({FIRST: [math.nan] * 3}, 1),
     ],

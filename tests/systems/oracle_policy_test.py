@@ -40,7 +40,7 @@ def ask(
     quantizer: ActionQuantizer | None = None,
     kept: list[float] | None = None,
 ) -> PickPlaceAction:
-    """The action for these object poses."""
+    """The oracle's action for these object poses and goals."""
     oracle = OraclePolicy(
         objects=objects or [HAMMER, PLIERS],
         grasps=grasps or [(HAMMER_GRASP,), (PLIERS_GRASP,)],
@@ -56,7 +56,7 @@ def ask(
 
 
 def ask_boxes(poses: list[RigidTransform], goals: list[Goal], **more) -> PickPlaceAction:
-    """The action for identical boxes."""
+    """The oracle's action for identical boxes."""
     objects = [PlacedObject(f"box {i}", BodyIndex(i + 1), BOX, 2) for i in range(len(poses))]
     grasps = more.pop("grasps", (ALONG_Y,))
     return ask(poses, goals, objects=objects, grasps=[grasps] * len(poses), **more)
@@ -73,7 +73,7 @@ def test_ports():
 
 
 def test_kept_goals_are_not_filled_again():
-    """A complete row was nudged, but is kept: the blocks on it must not be moved."""
+    """A complete stage that was nudged is not repaired, because later stages rest on it."""
     nudged = [HAMMER_GOAL.poses[0] @ planar(0.02, 0), planar(0.3, 0.0)]
     goals = [HAMMER_GOAL, dataclasses.replace(PLIERS_GOAL, after=(0,))]
     hammer = gripper_pose(nudged[0], HAMMER_GRASP)
@@ -115,7 +115,7 @@ def test_stops_when_every_goal_is_filled():
 
 @pytest.mark.parametrize("goal_yaw", [0.0, 1.0, math.pi, -2.5])
 def test_the_action_brings_the_object_to_its_goal(goal_yaw: float):
-    """The gripper carries the object rigidly, for any yaws of goal and object."""
+    """As the gripper carries the object rigidly, it arrives at the goal for any yaws of both."""
     X_WGoal = planar(0.5, 0.0, goal_yaw) @ planar(0.02, -0.03, 0.3, 0.033)
     X_WB = planar(0.35, 0.2, 2.9)
     action = ask([planar(0, 0), X_WB], [Goal("p", (1,), (X_WGoal,), 1.0)])
@@ -124,7 +124,7 @@ def test_the_action_brings_the_object_to_its_goal(goal_yaw: float):
     arrived = X_WPlace @ X_WPick.inverse() @ X_WB
     np.testing.assert_allclose(arrived.rotation().matrix(), X_WGoal.rotation().matrix(), atol=1e-12)
     np.testing.assert_allclose(arrived.translation()[:2], X_WGoal.translation()[:2], atol=1e-12)
-    # The jaws close across the object as annotated.
+    # In the object's frame, the pick is the annotated grasp.
     X_BPick = X_WB.inverse() @ X_WPick
     np.testing.assert_allclose(X_BPick.translation()[:2], (0.02, 0.01), atol=1e-12)
     assert RollPitchYaw(X_BPick.rotation()).yaw_angle() == pytest.approx(0.4)
@@ -169,7 +169,7 @@ def test_the_free_goal_pose_that_rotates_least_is_chosen():
     success = PoseWithin(0.02, 0.3)
     action = ask_boxes([bowls[0], planar(0.3, 0.3, 0.4)], [*goals, *goals], success=success)
     assert action.place.x == pytest.approx(0.6)
-    # The place has the heading of the free pose.
+    # The object is placed with the heading of the free bowl's pose, 0.
     assert action.place.theta == pytest.approx(action.pick.theta - 0.4)
 
 
@@ -232,7 +232,7 @@ def test_quantized_actions_are_the_nearest_possible(yaw: float, orientations: in
     assert abs(action.pick.y - pick.y) <= half_pixel
     assert abs(wrap_to_pi(action.pick.theta - pick.theta)) <= half_bin
     assert abs(wrap_to_pi(rotation - (-2.0 - yaw))) <= half_bin
-    # The place belongs to the rounded pick, not to the annotated grasp.
+    # The place is computed from the rounded pick, not from the annotated grasp.
     X_WPick = planar(action.pick.x, action.pick.y, action.pick.theta)
     ideal = (PLIERS_GOAL.poses[0] @ X_WB.inverse() @ X_WPick).translation()
     assert abs(action.place.x - ideal[0]) <= half_pixel

@@ -25,13 +25,13 @@ from systems.signals import (
 PICK, PLACE = PlanarPose(0.4, 0.3, 0.5), PlanarPose(0.55, -0.2, -0.8)
 HEIGHTS = SurfaceHeights(pick_top=0.05, highest=0.06)
 ACTION = PickPlaceAction(PICK, PLACE, heights=HEIGHTS)
-# The PerfectHand is far stiffer than a real one, so the limit is high.
+# PerfectHand is far stiffer than a real hand, so the force limit is high.
 PARAMETERS = PickPlaceParameters(grasp_depth_share=0.0, force_limit=140.0)
 TEN = 10
-"""Number of actions in most tests."""
+"""The largest number of actions in most tests."""
 GRASP_Z = 0.05 - PARAMETERS.grasp_depth
 HANGING = GRASP_Z
-"""How far the held object extends below the fingertips; it stood on the table."""
+"""How far the held object extends below the fingertips, because it stood on the table."""
 WIDTH, WEIGHT = 0.02, 6.0
 NO_TOUCH = -1.0
 
@@ -44,15 +44,17 @@ def mode_of(planner: PickPlacePlanner, context: Context) -> Mode:
 
 @dataclasses.dataclass
 class World:
-    """What the hand touches.
+    """The surfaces and the object that the hand touches.
 
     Attributes:
-        touch_pick: height of the surface on the pick side of the table, in m.
-        touch_place: height of the surface on the place side, in m.
-        cavity: (lowest yaw, highest yaw, height) of a cavity on the place side.
-        stiffness: of the surfaces, in N/m.
-        width: of the object between the pads in m, by attempt (from 1) and mode.
-        levers: how far the object hangs from the pads along them in m, by attempt, else zero.
+        touch_pick: the fingertip height at which something is touched on the pick side, in m.
+        touch_place: the same on the place side, where the held object touches, in m.
+        cavity: the lowest and highest yaw of the hand at which the object enters a cavity on the
+            place side, and `touch_place` there.
+        stiffness: the stiffness of the surfaces, in N/m.
+        width: the object's width between the pads in m, by attempt (from 1) and mode.
+        levers: by attempt, the distance (m) along the pads from the grasp to the object's centre
+            of mass; zero for other attempts.
         sticks: whether the jaws open only with force.
     """
 
@@ -67,14 +69,14 @@ class World:
 
 @dataclasses.dataclass
 class Jam(World):
-    """Adds a force (x, y, z) in N to what the hand feels in one mode."""
+    """A world that adds a force (x, y, z), in N, to what the hand feels in one mode."""
 
     mode: Mode = Mode.CARRY
     force: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 class PerfectHand(LeafSystem):
-    """Follows the desired motion exactly, stops the jaws at the object, and feels the World."""
+    """Follows the desired motion exactly, stops the jaws at the object, and feels contacts."""
 
     def __init__(self, world: World) -> None:
         super().__init__()
@@ -129,7 +131,7 @@ class PerfectHand(LeafSystem):
         touch = max(side - q[2], 0.0) * self._world.stiffness
         first_in_the_air = Mode.LIFT if self._world.levers else Mode.CARRY
         in_the_air = self._eval(context, "mode")[0] >= first_in_the_air
-        # Weight and inertia of the held object.
+        # The held object adds its weight and inertia.
         mass = WEIGHT / 9.81 if in_the_air and press > 0 and pad > 0 else 0.0
         load = -mass * (self._eval(context, "desired_motion")[8:11] + [0, 0, 9.81])
         force = np.array([*load, 0, pad, pad]) + [0, 0, touch, 0, 0, 0]
@@ -140,7 +142,7 @@ class PerfectHand(LeafSystem):
 
 
 class StubPolicy(LeafSystem):
-    """Returns one action a number of times, then stop; records when it is asked."""
+    """Returns one action a number of times, then a stop; records the times at which it is asked."""
 
     def __init__(self, actions: int, answer: PickPlaceAction) -> None:
         super().__init__()
@@ -181,7 +183,7 @@ class Run:
         for port in ("hand_state", "hand_contact_force", "wrist_moment"):
             builder.Connect(hand.GetOutputPort(port), self.planner.GetInputPort(port))
         builder.Connect(self.policy.get_output_port(), self.planner.GetInputPort("action"))
-        # A log doubles the time of a run.
+        # Logging doubles the time of a run.
         if is_logged:
             self.log = LogVectorOutput(
                 self.planner.GetOutputPort("desired_motion"), builder, 1 / 128
@@ -208,7 +210,7 @@ class Run:
         return self
 
     def until(self, mode: Mode) -> "Run":
-        """Runs until a mode has just begun."""
+        """Runs until a mode has just begun; returns this run."""
         while not self.modes or self.modes[-1][1] != mode:
             assert self.simulator.get_context().get_time() < 100
             self.simulator.AdvanceTo(self.simulator.get_context().get_time() + 1 / 64)
@@ -224,7 +226,7 @@ class Run:
 
     @property
     def counts(self) -> list[float]:
-        """Actions begun, grasps missed, objects dropped."""
+        """The numbers of actions begun, grasps missed, and objects dropped."""
         return self.output("counts").tolist()[:3]
 
 
@@ -286,7 +288,7 @@ def test_the_hand_reaches_the_commanded_poses():
     pick, place = accepted.pick, accepted.place
     assert (pick.x, pick.y, pick.theta) == (PICK.x, PICK.y, pytest.approx(turned))
     assert (place.x, place.y) == (PLACE.x, PLACE.y)
-    # The object rotates by exactly this. The hand itself may be rotated by a further pi.
+    # The object rotates exactly as the action says, but the hand may be turned by pi at both ends.
     assert run.output("desired_motion")[3] - turned == pytest.approx(PLACE.theta - PICK.theta)
     run.until(Mode.RETREAT)
     assert run.output("closing_force")[0] == 0
@@ -327,7 +329,7 @@ def test_an_object_that_would_turn_is_set_down_where_it_was_and_its_balance_is_t
     set_down, placed = run.output("history")
     assert (set_down.outcome, placed.outcome) == ("set down", "placed")
     assert placed.balance is None
-    # The hand may have turned by a further pi.
+    # The accepted pick's theta may differ from the given one by pi.
     theta = set_down.action.pick.theta
     felt = np.array(set_down.balance) - (PICK.x, PICK.y)
     np.testing.assert_allclose(felt, lever * np.array([np.cos(theta), np.sin(theta)]), atol=1e-3)
@@ -335,7 +337,7 @@ def test_an_object_that_would_turn_is_set_down_where_it_was_and_its_balance_is_t
 
 
 def resting_heights(run: Run) -> NDArray:
-    """The heights at which the hand has rested, in m."""
+    """The heights at which the hand was at rest during a run, in m."""
     motion = run.log.FindLog(run.simulator.get_context()).data()
     return motion[2, np.abs(motion[4:8]).max(axis=0) == 0.0]
 
@@ -363,7 +365,7 @@ def test_jaws_that_stick_to_the_object_are_opened_with_force():
 def test_lowering_stops_at_contact(height: float):
     run = Run(World(touch_place=height)).until(Mode.RELEASE)
     z = run.output("desired_motion")[2]
-    # Updates every 1/64 s: at most one period late, at the lowering speed.
+    # The planner updates every 1/64 s, so it stops at most one period late.
     assert height - PARAMETERS.lower_speed / 64 - 1e-4 <= z < height
     run.simulator.AdvanceTo(run.simulator.get_context().get_time() + 0.05)
     assert run.sequence[-1] == Mode.RELEASE
@@ -371,7 +373,7 @@ def test_lowering_stops_at_contact(height: float):
 
 
 def test_contact_force_is_measured_relative_to_the_payload():
-    """On a soft surface 4 N above the payload is 2 mm deep, 4 N in all would be 5 mm."""
+    """On a soft surface, the hand stops 2 mm deep, at 4 N beyond the object's weight."""
     soft = World(touch_place=0.04, stiffness=2000.0)
     run = Run(soft).until(Mode.RELEASE)
     deep = PARAMETERS.contact_threshold / soft.stiffness
@@ -408,7 +410,7 @@ def test_an_object_on_the_rim_is_rotated_into_its_cavity(offset: float):
 
 @pytest.mark.parametrize(("doubt", "follows"), [(0.0, Mode.RELEASE), (0.002, Mode.SEARCH)])
 def test_the_rim_check_allows_for_the_doubt_of_the_heights(doubt: float, follows: Mode):
-    """An object slightly below the measured rim may stand on it."""
+    """If heights are doubtful, an object that stops slightly below the rim may stand on it."""
     heights = dataclasses.replace(OVER_A_CAVITY.heights, doubt=doubt)
     world = World(touch_place=ON_THE_RIM - 0.0015)
     answer = dataclasses.replace(OVER_A_CAVITY, heights=heights)
@@ -424,7 +426,7 @@ def test_a_failed_search_ends_where_it_began():
     q = run.output("desired_motion")[:4]
     assert q[2] == pytest.approx(ON_THE_RIM, abs=2.5e-3)
     np.testing.assert_allclose(q[[0, 1, 3]], (PLACE.x, PLACE.y, PLACE.theta), atol=1e-9)
-    # It tries both directions and the spiral, up to its limits.
+    # The search rotates in both directions and follows the spiral, up to its limits.
     began = next(time for time, mode in run.modes if mode == Mode.SEARCH)
     log = run.log.FindLog(run.simulator.get_context())
     searched = log.data()[:4, log.sample_times() > began]
@@ -456,13 +458,13 @@ def test_no_search_is_made(touched: float, insertion: bool, amplitude: float):
 
 
 def test_an_object_placed_on_the_table_is_released_without_a_search():
-    """Insertion tasks too: the table has no cavity."""
+    """Even in insertion tasks, because the table has no cavity."""
     run = Run(World(touch_place=GRASP_Z), insertion=True).finish()
     assert run.sequence == [*PICK_AND_PLACE, Mode.OBSERVE, Mode.DONE]
 
 
 def test_the_rim_check_allows_for_the_height_of_the_support():
-    """Picked from a support 20 mm high, the object's bottom is 20 mm nearer to the fingertips."""
+    """If the object was picked from a support of 20 mm, its bottom is 20 mm nearer to the hand."""
     on_a_box = dataclasses.replace(HEIGHTS, support=0.02, place_rim=RIM)
     answer = dataclasses.replace(ACTION, heights=on_a_box)
     run = Run(World(touch_place=ON_THE_RIM - 0.02), answer=answer, insertion=True).finish()
@@ -472,7 +474,7 @@ def test_the_rim_check_allows_for_the_height_of_the_support():
 
 
 def seen(**heights: float) -> Observation:
-    """A table with a tall block in a corner, and surfaces at the pick and at the place."""
+    """A table with surfaces at the pick and the place and a block in a corner, at given heights."""
     grid = PixelGrid()
     image = np.full((4, *grid.shape), 0.5, np.float32)
     image[3] = heights.get("table", 0.0)
@@ -488,7 +490,7 @@ def test_heights_come_from_the_action_or_else_from_the_observation():
     assert run.output("desired_motion")[2] == pytest.approx(GRASP_Z)
     run = Run(observation=seen(table=0.01, pick=0.04)).until(Mode.CLOSE)
     assert run.output("desired_motion")[2] == pytest.approx(0.04 - PARAMETERS.grasp_depth)
-    # Nothing goes below the table, at any table height.
+    # The hand stays above the table, whatever the table's height is.
     run = Run(observation=seen(table=0.01, pick=0.012)).until(Mode.CLOSE)
     assert run.output("desired_motion")[2] == pytest.approx(0.01 + PARAMETERS.floor_clearance)
     run = Run(World(touch_place=NO_TOUCH), observation=seen(table=0.01)).until(Mode.RELEASE)
@@ -497,7 +499,7 @@ def test_heights_come_from_the_action_or_else_from_the_observation():
 
 @pytest.mark.parametrize("tallest", [0.05, 0.16])
 def test_travel_clears_the_highest_surface(tallest: float):
-    """Except for the last two centimetres, over the surfaces around the goal."""
+    """All the way but for the last two centimetres, which only clear the surfaces at the goal."""
     run = Run(observation=seen(pick=0.06, place=0.03, tallest=tallest), is_logged=True).finish()
     q = run.log.FindLog(run.simulator.get_context()).data()[:3]
     times = run.log.FindLog(run.simulator.get_context()).sample_times()
@@ -505,7 +507,7 @@ def test_travel_clears_the_highest_surface(tallest: float):
     hanging = 0.06 - PARAMETERS.grasp_depth
 
     def lowest(mode: Mode, before: PlanarPose | None, after: PlanarPose | None) -> float:
-        """Lowest fingertip height in a mode, away from its start and end."""
+        """The lowest fingertip height in a mode, away from the poses where it starts and ends."""
         during = (times >= begins[mode]) & (times < begins[Mode((mode + 1) % Mode.DONE)])
         for pose in (before, after):
             if pose is not None:
@@ -525,7 +527,7 @@ def test_travel_clears_the_highest_surface(tallest: float):
 
 @pytest.mark.parametrize("higher", [0.0, 0.006, 0.012])
 def test_an_object_gripped_higher_than_planned_clears_the_rim(higher: float):
-    """Early contact: more of the object hangs below the hand than o_t predicted."""
+    """After an early contact, more of the object hangs below the hand than o_t predicted."""
     world = World(touch_pick=GRASP_Z + higher if higher else NO_TOUCH)
     seen_heights = dataclasses.replace(HEIGHTS, near_place=0.05, place_rim=0.05)
     run = Run(world, answer=dataclasses.replace(ACTION, heights=seen_heights)).until(Mode.LIFT)
@@ -574,7 +576,7 @@ def test_descent_stops_at_contact():
     z = run.output("desired_motion")[2]
     late = PARAMETERS.descend_speed / 64
     assert touched - late < z <= touched
-    # It backs off, because the jaws cannot close while the fingertips press.
+    # The hand backs off, because the jaws cannot close while the fingertips press on something.
     backed_off = run.until(Mode.CHECK).output("desired_motion")[2]
     assert backed_off == pytest.approx(z + PARAMETERS.floor_clearance, abs=2e-4)
 
@@ -603,7 +605,7 @@ def test_a_missed_grasp_is_counted_and_retried():
 
 
 def test_the_latest_failed_picks_are_remembered():
-    """In their order, and no more than there is room for."""
+    """The port has room for 16 picks, which it holds in their order."""
     world = World(width=lambda attempt, mode: 0.0)
     run = Run(world, actions=18, parameters=dataclasses.replace(PARAMETERS, max_actions=18))
     picks = [dataclasses.replace(PICK, x=0.3 + 0.01 * number) for number in range(18)]
@@ -698,18 +700,18 @@ def test_motion_is_smooth_and_within_the_limits_of_its_mode(answer: PickPlaceAct
         mean_v, mean_a = (before[4:8] + v) / 2, (before[8:12] + a) / 2
         np.testing.assert_allclose(difference[:4], mean_v, atol=1e-3)
         np.testing.assert_allclose(difference[4:8], mean_a, atol=0.3)
-        for part in (slice(0, 2), slice(2, 3)):  # In the plane and along z.
+        for part in (slice(0, 2), slice(2, 3)):  # Horizontal; vertical.
             speed, acceleration = np.linalg.norm(v[part]), np.linalg.norm(a[part])
             assert speed <= speeds[mode] * 1.0001, mode
             assert acceleration <= accelerations[mode] * 1.0001, mode
             fastest[mode] = max(fastest.get(mode, 0.0), speed)
-        # Combined limit of both.
+        # Limits of the horizontal and vertical motion together.
         assert np.linalg.norm(v[:3]) <= 1.7
         assert np.linalg.norm(a[:3]) <= 13.0
         assert abs(v[3]) <= p.yaw_speed * 1.0001
         assert abs(a[3]) <= p.yaw_acceleration * 1.0001
         turning = max(turning, abs(v[3]))
-    # The limits are reached.
+    # Motions are as fast as the limits allow.
     assert fastest[Mode.LOWER] > 1.2 * p.contact_speed
     if answer is FAR:
         assert fastest[Mode.CARRY] == pytest.approx(p.carry_speed, rel=1e-2)
@@ -741,7 +743,7 @@ def test_an_object_is_pressed_down_with_closed_jaws():
     assert run.output("desired_opening")[0] == pytest.approx(0.0, abs=1e-3)
     run.until(Mode.RETREAT)
     assert run.sequence == [Mode.OBSERVE, Mode.APPROACH, Mode.DESCEND, Mode.RETREAT]
-    # 30 N at 10 kN/m, and at most one period more.
+    # The press stops 3 mm deep, at 30 N and 10 kN/m, at most one period late.
     z = run.output("desired_motion")[2]
     assert z == pytest.approx(0.047 - 0.003, abs=PARAMETERS.touch_speed / 64 + 1e-4)
     assert run.finish().counts == [1, 0, 0]
@@ -798,11 +800,11 @@ def test_the_guard_lets_a_smaller_force_pass(force: tuple):
 
 
 def test_a_load_pressed_at_the_end_of_a_carry_is_no_payload():
-    """The object touches before it should: it is let go there, and not pressed further."""
+    """An object that touches too early is released there, and not pressed down further."""
     touched = HANGING + GUARDED.hover_clearance + 0.002
     run = Run(World(touch_place=touched, stiffness=SOFT), parameters=GUARDED).until(Mode.RELEASE)
     assert run.output("desired_motion")[2] == pytest.approx(touched - 0.002, abs=1e-3)
-    # 2 mm at 2 kN/m, without the payload.
+    # The peak force is that of 2 mm at 2 kN/m, without the payload.
     assert run.output("peak_force")[0] == pytest.approx(4.0, abs=0.5)
 
 

@@ -110,7 +110,7 @@ def test_failed_picks_are_passed_to_the_policy():
     for failed in ((), (PlanarPose(0.4, 0.1, 0.2),)):
         policy.GetInputPort("failed_picks").FixValue(context, Value(failed))
         assert port.Eval(context) == ACTION
-    # Empty if not connected.
+    # The function first got no failed picks, because the port was not connected.
     assert given == [(), (), (PlanarPose(0.4, 0.1, 0.2),)]
 
 

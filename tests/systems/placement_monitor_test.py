@@ -47,7 +47,7 @@ def test_outputs_equal_evaluate_placements():
     for name in VECTORS:
         values = [float(getattr(item, name)) for item in expected]
         np.testing.assert_array_equal(system.GetOutputPort(name).Eval(context), values)
-    # No goal is left for the last object.
+    # For the last object no goal is left.
     assert system.GetOutputPort("add_s").Eval(context)[2] == np.inf
 
 
@@ -66,16 +66,16 @@ def test_a_stage_that_was_complete_when_an_action_began_is_kept():
         return system.GetOutputPort("kept_goals").Eval(context).tolist()
 
     assert advance(Mode.OBSERVE, first, away) == [0.0, 0.0]
-    # Completeness counts only when an action begins.
+    # Only a stage that is complete when an action begins is kept.
     assert advance(Mode.APPROACH, away, away) == [0.0, 0.0]
     assert advance(Mode.CARRY, first, away) == [0.0, 0.0]
     assert advance(Mode.OBSERVE, first, away) == [0.0, 0.0]
     assert advance(Mode.APPROACH, first, away) == [1.0, 0.0]
     assert system.reward(context) == 0.75
-    # From then on it counts as filled, and later goals need not wait.
+    # From then on the stage counts as filled, even if its object leaves, and later goals count.
     assert advance(Mode.RETREAT, away, second) == [1.0, 0.0]
     assert system.GetOutputPort("reward").Eval(context).tolist() == [1.0]
-    # The state lives in the context.
+    # The kept goals are state of the context, not of the system.
     clone = context.Clone()
     assert system.reward(clone) == 1.0
     system.SetDefaultContext(context)

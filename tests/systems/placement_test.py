@@ -21,7 +21,7 @@ from systems.placement import (
 )
 
 SQUARE = np.array([[1.0, 1.0, 0.0], [-1.0, 1.0, 0.0], [-1.0, -1.0, 0.0], [1.0, -1.0, 0.0]])
-"""Four points, 2 apart, which a quarter rotation maps onto themselves."""
+"""The corners of a square with sides of 2, which a quarter rotation maps onto itself."""
 
 GOAL = RigidTransform(RollPitchYaw(0, 0, 0.5), [0.5, -0.1, 0.03])
 BAR = 0.5 * np.array([[x, y, z] for x in (-0.2, 0.2) for y in (-0.03, 0.03) for z in (0, 0.02)])
@@ -41,27 +41,28 @@ def goal(*objects: int, pose: RigidTransform = GOAL, **fields) -> Goal:
 
 
 def place(item: PlacedObject, target: Goal, X_WB: RigidTransform, success=None) -> Placement:
-    """The placement of one object with respect to one goal."""
+    """The placement of an object, judged by one goal."""
     (placement,) = evaluate_placements([item], [target], success or AddS(), [X_WB])
     return placement
 
 
 def test_add_s_of_a_small_translation_is_its_length():
-    moved = RigidTransform([0.3, -0.4, 0.5])  # Less than half the points' distance.
+    moved = RigidTransform([0.3, -0.4, 0.5])  # Shorter than half the square's side.
     assert add_s(SQUARE, RigidTransform(), moved) == pytest.approx(np.sqrt(0.5))
 
 
 def test_add_s_takes_the_nearest_point_not_the_same_point():
-    # Two points onto their neighbours, two left behind: (0 + 0 + 2 + 2) / 4. ADD would say 2.
+    # Two goal points coincide with moved points, two are 2 from the nearest: (0 + 0 + 2 + 2) / 4.
+    # ADD would be 2.
     assert add_s(SQUARE, RigidTransform(), RigidTransform([2.0, 0.0, 0.0])) == pytest.approx(1.0)
 
 
 def test_add_s_measures_from_the_goal_to_the_actual_pose():
-    """Asymmetric shapes give two directed distances; equation 9 starts from the goal."""
+    """The distance depends on the direction; equation 9 measures from each of the goal's points."""
     points = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [3.0, 0.0, 0.0]])
-    moved = RigidTransform([3.0, 0.0, 0.0])  # Goal points at x = 0, 1, 3; actual at 3, 4, 6.
+    moved = RigidTransform([3.0, 0.0, 0.0])  # From goal points at x = 0, 1, 3 to 3, 4, 6.
     assert add_s(points, RigidTransform(), moved) == pytest.approx((3 + 2 + 0) / 3)
-    back = RigidTransform([-3.0, 0.0, 0.0])  # Goal points at x = 0, 1, 3; actual at -3, -2, 0.
+    back = RigidTransform([-3.0, 0.0, 0.0])  # From goal points at x = 0, 1, 3 to -3, -2, 0.
     assert add_s(points, RigidTransform(), back) == pytest.approx((0 + 1 + 3) / 3)
 
 
@@ -85,13 +86,13 @@ def test_errors_and_their_signs():
     assert placement.angle_error == pytest.approx(0.2)
     assert placement.height_error == pytest.approx(-0.02)
     assert placement.add_s == pytest.approx(add_s(BAR, GOAL, there))
-    # The angle takes the short way round.
+    # The angle error is the smaller of the two angles between the headings.
     across = goal(0, pose=planar(0, 0, 3.0))
     assert place(bar(), across, planar(0, 0, -3.0)).angle_error == pytest.approx(2 * math.pi - 6)
 
 
 def test_rolling_does_not_change_the_position_of_a_round_object():
-    """The origin is below the axis; positions are compared on the axis."""
+    """The object's origin is below its axis, but positions are compared on the axis."""
     angles = np.arange(16) * np.pi / 8
     ring = np.stack([0 * angles, np.sin(angles), 1 + np.cos(angles)], axis=1)
     rolled = (
@@ -155,14 +156,17 @@ def test_interchangeable_objects_fill_each_others_goals():
         placements = evaluate_placements(objects, goals, AddS(), order)
         assert [item.success for item in placements] == [True, True]
         assert {item.goal for item in placements} == {0, 1}
-    # A goal of one object is not filled by the other.
+    # A goal that belongs to one object is not filled by the other.
     fixed = [goal(0, pose=left, reward=0.5), goal(1, pose=right, reward=0.5)]
     assert not any(item.success for item in evaluate_placements(objects, fixed, AddS(), order))
 
 
 def test_a_correct_row_keeps_its_goals_beside_another_object():
-    """Shifting every object by one goal would reduce the total displacement: -2, -2, -2 mm against
-    0.5, 0.5 mm and the distance from the third object to its goal."""
+    """The first two objects are 2 mm from their goals, and the third is beside the row.
+
+    Assigning each object to the next goal would reduce the total displacement, but must not be
+    preferred.
+    """
     row = [planar(0, 0.05 * k) for k in range(3)]
     goals = [goal(0, 1, 2, pose=pose, reward=1 / 3) for pose in row]
     objects = [bar(k) for k in range(3)]
@@ -222,16 +226,16 @@ def test_a_complete_stage_keeps_its_reward():
     assert complete_stages(goals, half) == frozenset()
     kept = complete_stages(goals, whole)
     assert kept == {0, 1}
-    # It is kept from then on, and counted once.
+    # A complete stage is kept from then on, and is counted once.
     assert complete_stages(goals, fallen, kept) == kept
     assert (total_reward(goals, fallen), total_reward(goals, fallen, kept)) == (0.25, 0.5)
     assert total_reward(goals, at(*row, top), kept) == 1.0
-    # Later goals count on their own, as in Ravens, which removes a complete row from its goals.
+    # Goals after a kept stage count whatever happens to it. Ravens removes complete rows likewise.
     moved = evaluate_placements(objects, goals, AddS(), [row[0], away, top], kept)
     assert (moved[1].success, moved[2].success) == (False, True)
     assert total_reward(goals, moved, kept) == 1.0
     assert total_reward(goals, at(row[0], away, top)) == 0.25
-    # The last stage is no prerequisite, so it is not kept.
+    # No stage depends on the last one, so it is not kept.
     assert complete_stages(goals, at(*row, top)) == kept
     assert strict_reward(goals, fallen) == 0.25
 

@@ -15,7 +15,7 @@ AWAY, BESIDE = 1.0, 0.004
 
 
 class Table:
-    """Two bars of 20 x 2 cm, 20 cm apart, and a hand; the test sets their poses."""
+    """A detector for two bars of 20 x 2 cm, 20 cm apart, and a hand, whose poses the tests set."""
 
     def __init__(self, time_to_sleep: float = PATIENCE) -> None:
         bar = Box(RigidTransform(), np.array([0.1, 0.01, 0.01]))
@@ -32,7 +32,7 @@ class Table:
         self.poses[HAND] = RigidTransform([0, 0, AWAY])
 
     def advance(self, seconds: float) -> Context:
-        """Advances by this time, excluding the update at its end."""
+        """Advances by some time, without the update at its end."""
         context = self.simulator.get_mutable_context()
         poses = [RigidTransform(), *(self.poses[i] for i in (LEFT, RIGHT, HAND))]
         self.detector.GetInputPort("body_poses").FixValue(context, Value(poses))
@@ -40,7 +40,7 @@ class Table:
         return context
 
     def at_rest_after(self, seconds: float) -> list[bool]:
-        """Whether left and right are at rest after this time."""
+        """Whether the left and the right bar are at rest after some time."""
         context = self.advance(seconds)
         self.simulator.AdvancePendingEvents()
         assert self.detector.GetOutputPort("at_rest").Eval(context).tolist() == [
@@ -49,7 +49,7 @@ class Table:
         return self.detector.at_rest(context).tolist()
 
     def move_by(self, body: int, metres: float = 0.0, radians: float = 0.0) -> None:
-        """Moves a bar along itself and rotates it about its middle."""
+        """Moves a bar along its own x axis and rotates it about its middle."""
         motion = RigidTransform(RollPitchYaw(0, 0, radians), [metres, 0, 0])
         self.poses[body] = self.poses[body] @ motion
 
@@ -76,7 +76,7 @@ def test_rest_takes_time_to_sleep():
     ("metres", "radians"), [(0.8 * POSITION, 0.8 * ANGLE), (0.0, 0.8 * ANGLE), (0.0, 0.0)]
 )
 def test_an_object_that_trembles_in_place_rests(metres: float, radians: float):
-    """At any speed: one tolerance per 1/64 s is ten times one tolerance per `time_to_sleep`."""
+    """The speed does not matter: here it is ten times one tolerance per `time_to_sleep`."""
     table = Table()
     for sign in (1, -1) * 8:
         table.move_by(LEFT, sign * metres, sign * radians)
@@ -86,7 +86,7 @@ def test_an_object_that_trembles_in_place_rests(metres: float, radians: float):
 
 @pytest.mark.parametrize(("metres", "radians"), [(0.1 * POSITION, 0.0), (0.0, 0.1 * ANGLE)])
 def test_an_object_that_creeps_does_not_rest(metres: float, radians: float):
-    """Slow drift in one direction leaves the tolerance within ten periods."""
+    """A slow drift in one direction leaves the tolerance within ten periods."""
     table = Table()
     for _ in range(64):
         table.move_by(LEFT, metres, radians)
@@ -131,17 +131,17 @@ def test_an_object_outside_the_cell_rests_even_if_it_moves(metres: float):
 def test_an_awake_neighbour_wakes_a_sleeper():
     table = Table()
     table.poses[RIGHT] = RigidTransform([0, 0.1 - 0.02 - BESIDE, 0])
-    assert table.at_rest_after(1.0) == [True, True]  # Two adjacent bars may both rest.
+    assert table.at_rest_after(1.0) == [True, True]  # Adjacent bars may rest.
     # The hand touches the far side of the left bar only.
     table.poses[HAND] = RigidTransform([0, 0.1 + 0.01 + 0.02 + BESIDE, 0])
     assert table.at_rest_after(1 / 64) == [False, False]
-    # The neighbour moves away: only the bar near the hand stays awake.
+    # If the right bar is moved away, only the left one, which is near the hand, stays awake.
     table.poses[RIGHT] = RigidTransform([0, -0.1, 0])
     assert table.at_rest_after(1.0) == [False, True]
 
 
 def test_distances_are_between_oriented_boxes():
-    """The boxes' world-aligned bounds overlap here, but they are 3 cm apart."""
+    """The boxes are 3 cm apart, although their bounds along the world's axes overlap."""
     table = Table()
     turn = RollPitchYaw(0, 0, np.pi / 4)
     table.poses[LEFT] = RigidTransform(turn, [0, 0, 0])
@@ -153,7 +153,7 @@ def test_distances_are_between_oriented_boxes():
 
 
 def test_distances_are_to_the_pieces_of_a_body():
-    """The hand is in the bend of a hook: inside its enclosing box, but not near its two bars."""
+    """The hand is in the bend of a hook: inside the hook's enclosing box, but not near its bars."""
     hook = [
         Box(RigidTransform([0.1, 0, 0]), np.array([0.1, 0.01, 0.01])),
         Box(

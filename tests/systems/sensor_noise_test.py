@@ -73,7 +73,7 @@ def test_noise_grows_with_the_square_of_depth():
     for distance in (0.5, 1.0, 2.0):
         seen = depth_of(noise, context_of(noise, np.full((HEIGHT, WIDTH), distance)))
         assert seen.std() == pytest.approx(0.002 * distance**2, rel=0.02)
-        # Neighbours are correlated.
+        # The errors of neighbouring pixels are correlated.
         left, right = seen[:, :-1].ravel(), seen[:, 1:].ravel()
         assert np.corrcoef(left, right)[0, 1] > 0.7
 
@@ -109,7 +109,7 @@ def test_hole_shares_of_the_image_and_of_shiny_surfaces():
     holes = depth_of(noise, context) == 0
     assert not holes[:, : WIDTH // 2].any()
     assert 0.45 < holes[:, WIDTH // 2 :].mean() < 0.75
-    # A change of the labels takes effect.
+    # If the labels change, the holes change, too.
     labels.mutable_data[:] = 7
     noise.GetInputPort("label_image").FixValue(context, Value(labels))
     assert (depth_of(noise, context) != 0).all()
@@ -117,7 +117,7 @@ def test_hole_shares_of_the_image_and_of_shiny_surfaces():
 
 @pytest.mark.parametrize("normal", [(0.0, 0.0, 1.0), (0.7, 0.1, 0.7), (-0.3, 0.8, 0.5)])
 def test_pixels_at_grazing_angles_are_holes(normal: tuple[float, float, float]):
-    """On a plane the angle between each ray and the normal is known."""
+    """On a plane the angles between the rays and the normal are known."""
     x, y = np.meshgrid(
         (np.arange(WIDTH) + 0.5 - INFO.center_x()) / FOCAL,
         (np.arange(HEIGHT) + 0.5 - INFO.center_y()) / FOCAL,
@@ -136,7 +136,7 @@ def test_pixels_at_grazing_angles_are_holes(normal: tuple[float, float, float]):
 
 def test_holes_of_a_frontal_wall_are_symmetric():
     depth = np.full((HEIGHT, WIDTH), 0.7, np.float32)
-    # Near a corner some pixels exceed this angle and their neighbours do not.
+    # Near the image's corners, only some of the rays are steeper than this.
     noise = SensorNoiseParameters(steepest_deg=36.0)
     holes = noisy_depth(depth, noise, INFO, np.random.default_rng(0)) == 0
     assert 0 < holes.mean() < 0.5
@@ -206,7 +206,7 @@ def test_the_median_of_frames_is_less_noisy_and_has_fewer_holes():
         )
     )
     errors = [float(np.std(image[image > 0] - 1.2)) for image in (one, five)]
-    # The median of five normal values has a standard deviation of 0.536 of one's.
+    # The median of five normal values has 0.536 times the standard deviation of one.
     assert errors[0] == pytest.approx(0.002 * 1.2**2, rel=0.1)
     assert 0.5 < errors[1] / errors[0] < 0.62
     assert (one == 0).mean() > 0.05
@@ -226,7 +226,7 @@ def believed_pose(*, seed: int, number: int = 0, **errors: float) -> RigidTransf
 
 
 def rig_error(seed: int) -> RigidTransform:
-    """The error common to all cameras, about the middle of the workspace."""
+    """The pose error that all cameras share, about the middle of the workspace."""
     middle = RigidTransform([0.5, 0.0, 0.0])
     errors = {"rig_position_error": 0.01, "rig_angle_error_deg": 2.0}
     return middle.inverse() @ believed_pose(seed=seed, **errors) @ POSE.inverse() @ middle
@@ -252,8 +252,11 @@ def test_pose_errors_depend_on_the_seed(error: Callable[[int], RigidTransform]):
 def test_pose_errors_have_their_own_random_streams(
     error: Callable[[int], RigidTransform], own: list[int]
 ):
-    """Scenes use the streams [seed] and [seed, k] with small k, the rest of a cell larger ones.
-    NumPy pads with zeros: [seed, 15, 0] equals [seed, 15]."""
+    """No other stream [seed, ...] may give the same numbers.
+
+    Scenes use [seed] and [seed, k] with small k, the rest of a cell larger k. NumPy pads seeds with
+    zeros, so [seed, 15, 0] equals [seed, 15].
+    """
     shift = error(7).translation()
     shift = shift / np.linalg.norm(shift)
     others = [[stream, number] for stream in range(20) for number in range(3)]
@@ -274,7 +277,7 @@ def test_no_two_draws_share_a_stream(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("numpy.random.default_rng", recorded)
     noise = system(seed=7, depth_std=0.001)
     depth_of(noise, context_of(noise, np.ones((HEIGHT, WIDTH))))
-    # One each for rig, camera and image.
+    # The rig, the camera and the image have one stream each.
     assert len(streams) == 3
     assert len(set(map(tuple, streams))) == 3
 
@@ -289,7 +292,7 @@ def test_calibration_errors_have_the_given_sizes():
         believed(number, rig_position_error=0.003, rig_angle_error_deg=0.3) @ POSE.inverse()
         for number in (0, 1)
     ]
-    # The rig's error is the same for all cameras, about the middle of the workspace.
+    # All cameras have the same error of the rig, whose rotation is about the workspace's middle.
     assert rig[0].IsNearlyEqualTo(rig[1], 1e-12)
     assert np.linalg.norm(rig[0] @ np.array([0.5, 0, 0]) - (0.5, 0, 0)) == pytest.approx(0.003)
     angle = rig[0].rotation().ToAngleAxis().angle()

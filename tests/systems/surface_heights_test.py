@@ -10,7 +10,7 @@ PICK, PLACE = PlanarPose(0.40, 0.20), PlanarPose(0.60, -0.20)
 
 
 def observation(*boxes: tuple[PlanarPose, float, float]) -> Observation:
-    """Boxes by middle, half side and top height above the world's origin."""
+    """An observation of boxes with a middle, half a side, and the height of the top above z = 0."""
     image = np.full((4, *GRID.shape), 0.5, np.float32)
     image[3] = -GRID.z_min
     for middle, half, height in boxes:
@@ -52,7 +52,7 @@ def test_poses_off_the_grid_have_the_lowest_heights():
 
 
 def on_a_kit(grid: PixelGrid) -> np.ndarray:
-    """Heights (rows, cols): a tool of 20 mm, and a block of 50 mm with a cavity at the place."""
+    """Heights (rows, cols) of a tool of 20 mm and a block of 50 mm with a cavity at the place."""
     rows, cols = np.indices(grid.shape)
     x, y = np.moveaxis(grid.to_world(np.stack([rows, cols], axis=-1)), -1, 0)
     height = np.zeros(grid.shape)
@@ -78,7 +78,7 @@ def test_noise_and_calibration_errors_are_corrected(noise: float, off: float):
         image[3] = np.maximum(above, 0)
         found = read_surface_heights(Observation(image, grid, table=table), PICK, PLACE)
         errors.append([found.pick_top - 0.02, found.place_rim - 0.05, found.place_floor - 0.02])
-        # This difference decides whether the lowered object stands on the rim.
+        # The planner uses this difference to decide whether a lowered object stands on the rim.
         errors[-1].append(found.support - (found.place_rim - 0.05))
         assert (found.doubt > 0) == bool(noise or off)
     assert np.abs(errors).max() < (0.002 if noise else 0.0005)
@@ -86,7 +86,7 @@ def test_noise_and_calibration_errors_are_corrected(noise: float, off: float):
 
 @pytest.mark.parametrize("noise", [0.0, 0.0015])
 def test_unseen_pixels_do_not_count_as_the_table(noise: float):
-    """A hole covers most of the pick, and a tool on a block casts a shadow beside itself."""
+    """Most pixels at the pick are unseen, and so is the shadow beside the tool on a block."""
     grid = PixelGrid()
     row, col = np.rint(grid.to_pixel((PLACE.x, PLACE.y))).astype(int)
     height = noise * np.random.default_rng(0).standard_normal(grid.shape)
@@ -104,7 +104,7 @@ def test_unseen_pixels_do_not_count_as_the_table(noise: float):
 
 
 def test_edges_do_not_count_as_noise():
-    """A crowded table: half of the pixels are near an edge, and all are exact."""
+    """On a crowded table half of the pixels are near an edge, but all heights are exact."""
     image = np.full((4, *GRID.shape), 0.5, np.float32)
     image[3] = 0.0
     image[3, ::24] = image[3, 1::24] = 0.012

@@ -28,7 +28,7 @@ A_D = np.array([1.0, -2.0, 3.0, 4.0])
 
 
 def make(**changes: Any) -> tuple[TrajectoryController, Context]:
-    """A controller whose required ports hold the values above."""
+    """A controller and its context, in which `set_ports` has set the required ports."""
     controller = TrajectoryController(**{**PARAMETERS, **changes})
     context = controller.CreateDefaultContext()
     set_ports(controller, context)

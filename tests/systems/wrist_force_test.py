@@ -9,7 +9,8 @@ from kitting_drake.scenario.robots import FrankaArm
 from kitting_drake.station.robot import arm_model
 from systems.wrist_force import WristForce
 
-# The hand points down, 50 mm above the table; the arm faces 30 degrees away from +x.
+# With these joint positions the hand points down, 50 mm above the table. The base is turned by
+# 30 degrees.
 Q = np.array([0.4, 0.57, 0.2, -2.0, -0.1, 2.6, 1.1])
 ROBOT = FrankaArm(base=[0.1, 0.0, 0.0], yaw_deg=30.0)
 V = np.linspace(1.0, -1.5, 7)
@@ -24,7 +25,7 @@ def model() -> Model:
 
 
 def joint_torque(model: Model, q: NDArray[np.float64] = Q) -> NDArray[np.float64]:
-    """The torques of FORCE and TORQUE at G, by Drake's own Jacobian of another body's point."""
+    """The joint torques of FORCE and TORQUE at G, from the Jacobian that Drake computes."""
     plant, gripper = model
     context = plant.CreateDefaultContext()
     plant.SetPositions(context, np.append(q, [0.01, 0.01]))
@@ -52,7 +53,7 @@ def estimate(
     system = WristForce(arm=plant, gripper=gripper, step=STEP, noise=noise, seed=seed)
     context = system.CreateDefaultContext()
     context.SetTime(time)
-    # The torques are those before the last step.
+    # The torques belong to the positions before the last step, Q.
     state = np.concatenate([Q + STEP * V, [0.01, 0.01], V, [0.0, 0.0]])
     system.GetInputPort("robot_state").FixValue(context, state)
     system.GetInputPort("joint_contact_torque").FixValue(context, torque)
