@@ -19,8 +19,8 @@ ROOT = Path(__file__).resolve().parents[1]
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 
-# Modules and tests stay in memory. Without this, a third of the time of importing them, and more
-# later, is spent on looking for garbage among them.
+# Modules and tests stay in memory, so there is little garbage among them. Looking for it would take
+# a third of the time of importing them, and more later.
 gc.disable()
 
 

@@ -1,6 +1,6 @@
 """escnn works without lie_learn and without a compiler.
 
-Here its layers for the plane run in a new process; in this one `escnn_reference_test` runs them.
+Layers for the plane run in a new process here, and in the tests' own in `escnn_reference_test`.
 """
 
 import subprocess

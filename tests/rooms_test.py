@@ -116,7 +116,7 @@ class Tree:
 
 
 def _statements(node: ast.AST, *, loaded: bool = False) -> Iterator[ast.AST]:
-    """All statements below a node.
+    """All statements that a node contains, at any depth.
 
     Args:
         node: a module or a statement.

@@ -39,7 +39,7 @@ BAD = {11, 14, 15}
 
 
 class Oracle:
-    """Demonstrates immediately, or is killed; records the seeds of its calls."""
+    """Demonstrates immediately, until it is interrupted; records the seeds that it is asked for."""
 
     def __init__(self, killed_after: int = 1000) -> None:
         self.asked: list[int] = []
@@ -49,7 +49,7 @@ class Oracle:
         if len(self.asked) == self._killed_after:
             raise KeyboardInterrupt
         self.asked.append(seed)
-        # Some seeds end before earlier ones.
+        # Some seeds take longer, so that later ones end before them.
         time.sleep(0.02 * (seed % 3 == 1))
         if seed in BAD:
             return Rejection(seed, 0.5, f"{seed} is bad")
@@ -373,8 +373,8 @@ def test_a_repeatedly_killed_run_collects_the_same_file(verb_process, tmp_path: 
     assert done.returncode == 0, done.stderr
     command = [sys.executable, "-m", "kitting_drake.collect", scenario, *counts]
     rng = random.Random(0)
-    # Kill by progress, which does not depend on the machine's speed: when some more seeds are kept,
-    # or for 0 at a random time before the first one is.
+    # Kill the run when it has kept `more` further seeds, so that the machine's speed does not matter.
+    # If `more` is 0, kill it at a random time before it keeps one.
     for more in (0, 1, 0, 2, 1, 0, 1, 2):
         process = subprocess.Popen(
             [*map(str, command), "--output", killed], cwd=ROOT, stdout=subprocess.DEVNULL

@@ -96,7 +96,7 @@ def test_wall_clock_times_of_all_runs_add_up(tmp_path: Path, monkeypatch: pytest
     with pytest.raises(KeyboardInterrupt):
         total(0, 1, 2)
     now += 7000.0
-    # A stopped run counts until its last episode.
+    # The time of a run that was stopped counts up to its last episode.
     assert total(0, 1) == 100.0
     (tmp_path / "wall_seconds.json").write_text("{")
     with pytest.raises(UserError, match=r"wall_seconds\.json is damaged: delete it"):
@@ -224,7 +224,7 @@ def test_evaluates_if_any_seed_can_be_built(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_missing_rendering_is_not_a_failed_episode(monkeypatch: pytest.MonkeyPatch):
-    """It is an error instead, because a failed episode would never be run again."""
+    """Missing rendering is an error, because a failed episode would never be run again."""
     monkeypatch.setattr(cameras, "can_render", lambda: False)
     looks = PythonPolicy(function="systems.signals:PickPlaceAction")
     chosen = dataclasses.replace(CHOSEN, scenario=Scenario(policy=looks))

@@ -316,7 +316,7 @@ def test_a_run_is_added_and_removed(folder: Path, monkeypatch: pytest.MonkeyPatc
     (files,) = tables(text)["Runs"]
     assert [row[0] for row in files[1:]] == ["mine", "ours", "quantized"]
     assert read_summaries(folder)["mine"] == summary
-    # Adding it again changes nothing. Another run of the same name is refused.
+    # Adding the run again changes nothing. Another run of the same name is refused.
     command(monkeypatch, folder, "--add", "mine", str(evaluated), "--quiet")
     (evaluated / "summary.json").write_text(json.dumps(summary | {"outcomes": []}))
     with pytest.raises(UserError, match="has another run 'mine': give another name"):

@@ -495,7 +495,7 @@ def test_refuses(
 
 VALIDATIONS = {
     "overlapping": (range(13, 15), ORIGIN, "share seed 13"),
-    # The scenes are the same with another time limit, other tries, or a field that is new.
+    # Scenes do not depend on the time limit, the tries, or fields that older files lack.
     "the same tables": (
         range(13, 15),
         dataclasses.replace(

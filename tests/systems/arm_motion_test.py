@@ -211,7 +211,7 @@ def test_the_hand_follows_its_heights(has_inertia: bool):
     lift = tips[Mode.LIFT]
     away = np.linalg.norm(lift[:, :2] - (0.6, 0.3), axis=1)
     near = np.linalg.norm(lift[:, :2] - (0.5, -0.3), axis=1)
-    # Averaging rounds off the corners of the way, so it may be a little too low there.
+    # The corners of the way are rounded off, so the way may be a little too low near them.
     assert lift[(away > 0.007) & (near > 0.021), 2].min() > state.travel_z - 0.004
     assert lift[-1, 2] == pytest.approx(state.place_hover_z)
     for mode, goal in ((Mode.DESCEND, (0.6, 0.3)), (Mode.LOWER, (0.5, -0.3))):

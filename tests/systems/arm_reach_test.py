@@ -64,7 +64,7 @@ def search(limits: ArmLimits, pose: NDArray, rng: np.random.Generator) -> bool:
 
 
 def disagreements(limits: ArmLimits, poses: int, seed: int) -> tuple[list[str], int]:
-    """The random poses about which both differ, as texts, and how many the closed form reaches."""
+    """The poses about which the methods differ, as texts, and how many the closed form reaches."""
     rng, postures = np.random.default_rng(seed), ArmPostures(limits, BASE)
     reached, found = 0, []
     for _ in range(poses):
@@ -72,7 +72,7 @@ def disagreements(limits: ArmLimits, poses: int, seed: int) -> tuple[list[str], 
         yaw = rng.uniform(-math.pi, math.pi)
         stop = HandStop("the pick", x, y, yaw, low=z, high=z, surface=-1.0)
         problem = reach_problem(postures, [stop])
-        # The search ignores collisions, so a pose that is refused only for a collision is reached.
+        # The search ignores collisions, so poses that only a collision rules out count as reached.
         says = not problem or "collide" in problem
         pose = BASE.to_base([x, y, z, yaw])
         # Few starts miss some poses that can be reached: try again where the closed form says so.

@@ -46,7 +46,7 @@ def test_a_load_is_known_as_it_is_lifted_but_no_more_than_the_hand_can_carry():
     assert known_payload(hand.state) == pytest.approx(-3.0 * GRAVITY)
     hand.feel((0, 0, -10.0))
     hand.state.mode = Mode.CARRY
-    # Until enough samples are weighed, the payload is the last one that was felt.
+    # Until enough samples are weighed, the payload is the force that was felt last.
     hand.feel((0, 0, -12.0), times=2)
     assert known_payload(hand.state) == -10.0
     hand.feel((0, 0, -12.0), times=20)
@@ -88,7 +88,7 @@ def test_a_press_is_limited_by_its_own_force():
 def test_a_rising_hand_may_be_pushed_but_not_held():
     assert not Hand(Mode.RETREAT).feel((0, 0, 50.0), times=10)
     assert Hand(Mode.RETREAT).feel((0, 0, -50.0), times=3)
-    # While an object is lifted, a force of up to 3 kg is its weight, not a contact.
+    # While an object is lifted, it may pull with 29 N: objects may weigh up to 3 kg.
     assert not Hand(Mode.LIFT).feel((0, 0, -29.0), times=10)
     assert Hand(Mode.LIFT).feel((0, 0, -29.0 - 31.0), times=3)
 

@@ -146,7 +146,8 @@ def test_heightmap_shows_the_box_at_its_true_pose(scene, xy, yaw_deg):
     assert np.max(np.abs(lit_xy.mean(axis=0) - xy)) < 0.5 * GRID.resolution
     _, axes = np.linalg.eigh(np.cov(lit_xy.T))
     angle = math.degrees(math.atan2(axes[1, 1], axes[0, 1]))
-    assert abs(math.remainder(angle - yaw_deg, 180)) < 1.5  # One pixel over its length is 1.8.
+    # An error of one pixel over the box's length would be 1.8 degrees.
+    assert abs(math.remainder(angle - yaw_deg, 180)) < 1.5
 
     # Shading scales a colour but keeps its hue. At outlines the renderer blends the two.
     blank = np.all(observation.image == 0, axis=0)
@@ -251,7 +252,7 @@ def test_flat_ground_reproduces_the_camera_image():
 
 def test_each_pixel_takes_height_and_color_of_its_highest_point():
     depth = FLAT.copy()
-    depth[0, 0] = 0.5  # At x = 0.2 - 0.075, y = 0.25 - 0.1, in grid pixel (1, 1).
+    depth[0, 0] = 0.5  # At x = 0.125, y = 0.15, in pixel (1, 1) of the grid.
     image = _project((COLOR, depth))
     np.testing.assert_allclose(image[:, 1, 1], [*RGB[0, 0], 0.5], atol=1e-6)
     np.testing.assert_array_equal(image[:, 0, 0], 0)

@@ -34,7 +34,7 @@ def test_pixels_outside_all_images_are_out_of_view():
     seen = project([flat(focal=900.0)], GRID)
     assert 0.1 < seen.in_view.mean() < 0.7
     assert seen.valid[seen.in_view].mean() > 0.99
-    # Pixels count as in view by the table's height; at the image's edge a box may show beyond.
+    # A pixel is in view if the table there would be; a box at an image's edge may show beyond it.
     assert seen.valid[~seen.in_view].mean() < 0.03
     middle = tuple(np.rint(GRID.to_pixel((0.5, 0.0))).astype(int))
     assert seen.in_view[middle]

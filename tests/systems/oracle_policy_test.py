@@ -115,7 +115,7 @@ def test_stops_when_every_goal_is_filled():
 
 @pytest.mark.parametrize("goal_yaw", [0.0, 1.0, math.pi, -2.5])
 def test_the_action_brings_the_object_to_its_goal(goal_yaw: float):
-    """As the gripper carries the object rigidly, it arrives at the goal for any yaws of both."""
+    """The gripper carries the object rigidly, so for any yaw the object arrives at its goal."""
     X_WGoal = planar(0.5, 0.0, goal_yaw) @ planar(0.02, -0.03, 0.3, 0.033)
     X_WB = planar(0.35, 0.2, 2.9)
     action = ask([planar(0, 0), X_WB], [Goal("p", (1,), (X_WGoal,), 1.0)])

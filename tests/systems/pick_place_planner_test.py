@@ -31,7 +31,7 @@ TEN = 10
 """The largest number of actions in most tests."""
 GRASP_Z = 0.05 - PARAMETERS.grasp_depth
 HANGING = GRASP_Z
-"""How far the held object extends below the fingertips, because it stood on the table."""
+"""How far the held object extends below the fingertips: to the table, on which it stood."""
 WIDTH, WEIGHT = 0.02, 6.0
 NO_TOUCH = -1.0
 
@@ -700,7 +700,7 @@ def test_motion_is_smooth_and_within_the_limits_of_its_mode(answer: PickPlaceAct
         mean_v, mean_a = (before[4:8] + v) / 2, (before[8:12] + a) / 2
         np.testing.assert_allclose(difference[:4], mean_v, atol=1e-3)
         np.testing.assert_allclose(difference[4:8], mean_a, atol=0.3)
-        for part in (slice(0, 2), slice(2, 3)):  # Horizontal; vertical.
+        for part in (slice(0, 2), slice(2, 3)):  # Horizontally, then vertically.
             speed, acceleration = np.linalg.norm(v[part]), np.linalg.norm(a[part])
             assert speed <= speeds[mode] * 1.0001, mode
             assert acceleration <= accelerations[mode] * 1.0001, mode

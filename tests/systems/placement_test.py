@@ -60,9 +60,9 @@ def test_add_s_takes_the_nearest_point_not_the_same_point():
 def test_add_s_measures_from_the_goal_to_the_actual_pose():
     """The distance depends on the direction; equation 9 measures from each of the goal's points."""
     points = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [3.0, 0.0, 0.0]])
-    moved = RigidTransform([3.0, 0.0, 0.0])  # From goal points at x = 0, 1, 3 to 3, 4, 6.
+    moved = RigidTransform([3.0, 0.0, 0.0])  # The object's points are at x = 3, 4, 6.
     assert add_s(points, RigidTransform(), moved) == pytest.approx((3 + 2 + 0) / 3)
-    back = RigidTransform([-3.0, 0.0, 0.0])  # From goal points at x = 0, 1, 3 to -3, -2, 0.
+    back = RigidTransform([-3.0, 0.0, 0.0])  # The object's points are at x = -3, -2, 0.
     assert add_s(points, RigidTransform(), back) == pytest.approx((0 + 1 + 3) / 3)
 
 

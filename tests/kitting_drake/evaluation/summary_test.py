@@ -103,7 +103,7 @@ def test_categories_add_up_to_the_whole():
         make_episode(0, [1.0, 1.0]),
         make_episode(1, [2.0, 9.0]),
         make_episode(2, [1.0, 1.0], failure="solver"),
-        # The names of its objects are lost.
+        # The names of a lost episode's objects are unknown.
         make_lost_episode(3),
     ]
     summary = summarised(episodes)
@@ -177,7 +177,7 @@ def test_intervals_of_partial_rewards_are_over_episodes():
 
 
 def test_intervals_of_dependent_objects_are_over_episodes():
-    """So they are even where an episode's reward is the fraction of its objects that succeed."""
+    """Even if an episode's reward is the fraction of its objects that succeed, as here."""
     chosen = dataclasses.replace(CHOSEN, scenario=Scenario(task=StackBlockPyramid()))
     episodes = [make_episode(seed, [1.0, 9.0 if seed % 2 else 1.0]) for seed in range(6)]
     summary = summarise(episodes, chosen, PoseWithin(), wall_seconds_total=1.0)

@@ -267,7 +267,7 @@ def test_gymnasium_imports_the_module_from_the_environments_name():
 
 @pytest.mark.slow
 def test_a_step_costs_what_an_action_costs_in_evaluate(monkeypatch: pytest.MonkeyPatch):
-    """Compares the same decisions through both by CPU time, which ignores other processes."""
+    """Compares the CPU time of the same actions in the environment and in `evaluate`."""
     path = Path("kitting_unseen.yaml")
     environment = gymnasium.make("kitting_drake/KittingUnseen-v0")
     evaluated(path, Recorder(), 1, monkeypatch, "KittingUnseenToolsets")

@@ -35,7 +35,7 @@ def rotate_image(image: Tensor, degrees: float) -> Tensor:
 
 
 def relative_error(found: Tensor, expected: Tensor) -> float:
-    """The error of square images in an interior disc, relative to their own variation."""
+    """The norm of the difference in a disc inside the images, relative to their variation there."""
     disc = distance_from_middle(expected.shape[-1]) < 0.7
     variation = expected[..., disc] - expected[..., disc].mean(-1, keepdim=True)
     return float((found - expected)[..., disc].norm() / variation.norm())

@@ -57,7 +57,7 @@ def config(method: str, *, stop: bool = False) -> NetworkConfig:
 
 
 def scene(seed: int, degrees: float = 0.0) -> LabelledImage:
-    """A scene at some rotation, for which it is rendered, not resampled.
+    """A scene that is rendered at a rotation, so that its image is not resampled.
 
     The tool is picked at its neck, along its handle. Without rotation the labels lie on pixels and
     bins.

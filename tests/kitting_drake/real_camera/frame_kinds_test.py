@@ -101,7 +101,7 @@ def write_grey_exr(folder: Path) -> None:
 
 
 def write_text_ply(folder: Path) -> None:
-    """As Open3D writes it."""
+    """Writes an ASCII PLY file as Open3D does."""
     rows = (
         f"{x:.9g} {y:.9g} {z:.9g} {r} {g} {b}"
         for (x, y, z), (r, g, b) in zip(POINTS, COLOR.reshape(-1, 3), strict=True)
@@ -113,7 +113,7 @@ def write_text_ply(folder: Path) -> None:
 
 
 def write_binary_ply(folder: Path) -> None:
-    """As Open3D writes it."""
+    """Writes a binary PLY file as Open3D does."""
     head = "ply\nformat binary_little_endian 1.0\nelement vertex 48\n"
     head += "".join(f"property double {axis}\n" for axis in "xyz")
     head += "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))

@@ -102,7 +102,7 @@ def test_a_tool_may_stand_out():
     parameters = KitParameters(always_nested=True, stand_out=0.004)
     for tool, pose in zip(tools, layout_kit(tools, parameters).poses, strict=True):
         assert pose.z + tool.height == pytest.approx(parameters.height + 0.004)
-    # A block of 12 mm is high enough for a tool of 8 mm that stands out by 4 mm, but not by 5 mm.
+    # A tool that stands out fits into a block of 12 mm.
     layout_kit(tools, KitParameters(always_nested=True, stand_out=0.004, height=0.012))
     with pytest.raises(UserError, match=r"'plate_90x40x8' is 8\.0 mm high.* by at most 4\.0 mm"):
         layout_kit(tools, KitParameters(always_nested=True, stand_out=0.005))

@@ -1,4 +1,4 @@
-"""A fixture that exports kits without their pictures."""
+"""A fixture with which kits are exported without their pictures."""
 
 import pytest
 

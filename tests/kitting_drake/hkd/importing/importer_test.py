@@ -33,7 +33,7 @@ REAL = Path(os.environ.get("KITTING_REAL_TOOLS", ROOT.parent / "shared" / "real_
 
 
 def mallet() -> trimesh.Trimesh:
-    """A handle and a head with a flat bottom, 175 mm long, in mm."""
+    """A mallet, 175 mm long, with a flat bottom: a handle and a head. Its unit is mm."""
     handle = Manifold.cube((170, 20, 12), True).translate((0, 0, -2))
     head = Manifold.cube((26, 50, 16), True).translate((77, 5, 0))
     vertices, faces = vertices_and_faces(handle + head)
@@ -233,7 +233,7 @@ def test_small_tools_keep_their_length(tmp_path: Path):
 
 @pytest.mark.slow
 def test_a_drive_socket_keeps_its_length(tmp_path: Path):
-    """It is round and hollow at both ends, with a hexagon and a square."""
+    """The socket is round, with a hexagonal hole at one end and a square hole at the other."""
     socket = Manifold.cylinder(25, 11, circular_segments=48)
     socket -= Manifold.cylinder(14, 7.5, circular_segments=6).translate((0, 0, 12))
     socket -= Manifold.cube((9.6, 9.6, 10), True).translate((0, 0, 4))
@@ -605,7 +605,7 @@ def test_real_tools(name: str, tmp_path: Path):
 
 @pytest.mark.slow
 def test_an_unbalanced_tool_is_laid_in_its_resting_pose(tmp_path: Path):
-    """A thick handle just balances a long shaft above the table, so it tips at a touch."""
+    """The thick handle just balances the long shaft above the table; a touch tips the tool over."""
     handle = Manifold.cube((40, 30, 30), True).translate((-20, 0, 0))
     shaft = Manifold.cube((97, 12, 12), True).translate((48.5, 0, 0))
     whole = (handle + shaft).translate((-28.5, 0, 15)).scale((1.2, 1.2, 1.2))

@@ -55,7 +55,7 @@ def true_places(scene):
 
 
 def errors_of(action, scene) -> tuple[float, float]:
-    """The errors of an action's place, in metres and radians, if it picks the nearest object."""
+    """The errors of an action's place, in m and rad, for the object nearest to its pick."""
     pick, place = (np.array([p.x, p.y]) for p in (action.pick, action.place))
     lies, belongs = min(true_places(scene), key=lambda o: math.dist(o[0][:2], pick))
     rotation = belongs[2] - lies[2]

@@ -120,7 +120,7 @@ def test_wrong_stop_decisions_are_counted_and_cost_as_if_lost():
     [
         # If the log-odds separate, the threshold is between, nearer to the final observations.
         ((3.0, 9.0, 5.0), (-1.0, -7.0), 0.0),
-        # If not, it makes the fewest errors; of equally good thresholds it is the lower one.
+        # Otherwise the threshold makes the fewest errors; of equally good ones it is the lower one.
         ((3.0, 5.0, 6.0, -2.0), (-1.0, -3.0, 0.0), 0.75),
         ((1.0,), (2.0,), 0.0),
         ((), (1.0,), None),

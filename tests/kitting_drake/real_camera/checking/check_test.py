@@ -56,7 +56,7 @@ def frames_of_block() -> dict[str, Frame]:
 def noisy(
     frames: dict[str, Frame], longer: float = 0.0, *, noise=MODERATE, takes: int = 1
 ) -> dict[str, Frame]:
-    """Frames with noise, whose depths are `longer` (m) and the median of some takes."""
+    """Frames with noise. Each depth is the median of some takes, and too long by `longer` (m)."""
     random = np.random.default_rng(0)
     result = {}
     for name, frame in frames.items():

@@ -201,7 +201,7 @@ def two_cameras(folder: Path) -> tuple[Board, list[NDArray], Path]:
 
 
 def test_the_command(tmp_path: Path, verb: Callable):
-    """Two frames of two cameras each give one calibration, a report and pictures."""
+    """Two frames from each of two cameras give one calibration, a report and pictures."""
     board, X_MK, path = two_cameras(tmp_path)
     out, frames = tmp_path / "out", (tmp_path / "frame1", tmp_path / "frame2")
     given = ("--calibrate", tmp_path / "board.yaml", "--camera", path, "--output", out)

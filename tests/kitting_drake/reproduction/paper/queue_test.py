@@ -448,7 +448,7 @@ def test_the_exit_code_reports_failures(
 
 @pytest.mark.slow
 def test_stopping_the_queue_stops_its_child_process(tmp_path: Path):
-    """The real commands run, which lock their folders."""
+    """The queue runs the real commands, which lock their folders."""
     command = [sys.executable, "-m", "kitting_drake.benchmark", "paper"]
     command += ["--cells", "unseen_quantized_oracle_180", "--results", str(tmp_path / "results")]
     work = tmp_path / "work"

@@ -43,7 +43,7 @@ def placed(shape: CrossSection, X: RigidTransform) -> CrossSection:
 
 
 def hand(tool: Tool, size: tuple[float, float]) -> CrossSection:
-    """A rectangle that stands for the hand, of the given size, at a tool's grasp, in its frame."""
+    """A rectangle of the given size that stands for the hand at a grasp, in the tool's frame."""
     grasp = tool.grasp
     rectangle = CrossSection.square(size, True).rotate(float(np.rad2deg(grasp.theta)))
     return rectangle.translate((grasp.x, grasp.y))

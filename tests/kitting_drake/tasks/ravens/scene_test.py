@@ -154,7 +154,7 @@ def test_objects_are_free_and_reachable(kind: type[TaskConfig], seed: int):
 @each_task
 @pytest.mark.parametrize("seed", SEEDS)
 def test_goals_are_free_and_reachable(kind: type[TaskConfig], seed: int):
-    """If goals are filled in order, the hand has room to open there."""
+    """If goals are filled in order, the hand has room to open at each of them."""
     posed = Posed(kind, seed)
     filled: set[int] = set()
     taken: list[np.ndarray] = []
@@ -211,7 +211,7 @@ def test_boxes_appear_one_at_a_time(sleeps: bool):
 
 
 def test_surface_points_span_the_object():
-    """They must reach its ends, because positions are compared at the middle of their bounds."""
+    """The points must reach the object's ends: their middle is where positions are compared."""
     block = make_scene(BlockInsertion(), 0).objects[0]
     np.testing.assert_allclose(block.p_BPoints.min(axis=0), [-0.015, -0.015, 0], atol=1e-12)
     np.testing.assert_allclose(block.p_BPoints.max(axis=0), [0.065, 0.065, 0.04], atol=1e-12)

@@ -23,7 +23,7 @@ def random_series(seed: int, frequencies: tuple[int, ...]) -> NDArray[np.float64
 def value(
     coefficients: NDArray[np.float64], frequencies: tuple[int, ...], angle: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Equation 5, term by term."""
+    """The sum of the series of equation 5 at some angles, added term by term."""
     rest = list(coefficients)
     total = np.zeros_like(angle)
     for j in frequencies:

@@ -10,7 +10,7 @@ QUOTIENT = Regular(8, quotient=2)
 
 
 def kernels(layer: GroupConv2d) -> Tensor:
-    """(D, entries): the layer's kernels for each unit vector of weights."""
+    """The layer's kernels for each of the D unit vectors of weights, as an array (D, entries)."""
     count = layer.weights.shape[-1]
     rows = []
     with torch.no_grad():
