@@ -18,7 +18,7 @@ from kitting_drake.policies.networks.methods import make_networks
 from kitting_drake.policies.stages import SubPixel
 from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
 
-# All numbers differ from each other and from the defaults, so that none can be confused.
+# All values differ from the defaults, so that a policy that ignores the grid fails.
 GRID = PixelGrid(x_min=0.3, y_min=-0.2, resolution=0.004, rows=97, cols=129, z_min=0.02, z_max=0.3)
 PICK = (61.3, 22.4)
 GOAL = np.array([40, 90])

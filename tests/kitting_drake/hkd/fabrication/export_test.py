@@ -53,7 +53,7 @@ def own_tool(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def bar(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a rectangular tool, around which a tight block has no room for a label."""
+    """The folder of a rectangular tool; a tight block leaves no room for notches or labels."""
     folder = tmp_path_factory.mktemp("bar")
     (folder / "bar.svg").write_text(
         '<svg xmlns="http://www.w3.org/2000/svg" width="160mm" height="14mm" viewBox="0 0 160 14">'
