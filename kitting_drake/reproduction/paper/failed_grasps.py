@@ -63,9 +63,8 @@ def changeable(summary: Mapping[str, Any]) -> Changeable:
       one follow it.
     - At most, n episodes begin with a failed grasp, and all of their later actions follow it. The
       other episodes need at least one action for each placed object. So the bound is the number of
-      all actions, minus n, minus the number of objects placed in the other episodes. It assumes
-      that the n episodes are those with the fewest placed objects. It is also at most the number of
-      actions that the task allows in n episodes, minus n.
+      all actions, minus n, minus the least number of objects placed in any E - n episodes. It is
+      also at most the number of actions that the task allows in n episodes, minus n.
 
     Args:
         summary: the summary that `evaluate` wrote for a learned policy. If it has no number of
@@ -85,8 +84,9 @@ def changeable(summary: Mapping[str, Any]) -> Changeable:
         return Changeable(0, 0, actions)
     with_failure = min(failed, len(episodes))
     placed = sorted(max(1, sum(end > 0 for end in objects.values())) for objects in episodes)
+    others = placed[: len(episodes) - with_failure]
     at_most = min(
-        actions - sum(placed[with_failure:]) - with_failure,
+        actions - sum(others) - with_failure,
         sum(sorted(most)[-with_failure:]) - with_failure,
     )
     return Changeable(failed - with_failure, at_most, actions)
