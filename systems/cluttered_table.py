@@ -114,7 +114,7 @@ class ClutteredTable:
     """For each thing that never moves, points (m, 3) of its surface in the world, in metres."""
     planner: PickPlaceParameters = field(default_factory=PickPlaceParameters)
     ledge: Ledge | None = None
-    """A block over whose edges objects can be turned."""
+    """A block. The hand can turn an object over by tipping it across one of its edges."""
 
     def points(self, poses: Sequence[RigidTransform]) -> list[Points]:
         """For each object, points (m, 3) of its surface in the world, in metres."""

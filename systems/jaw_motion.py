@@ -11,7 +11,8 @@ class JawMotion:
     """Computes jaw openings and closing forces in all modes from the planner's state."""
 
     settles = math.inf
-    """Infinite: `tare_settle` sets how long the hand needs to come to rest. See `RobotMotion`."""
+    """Infinite, so that `tare_settle` alone sets how long the hand comes to rest; see
+    `RobotMotion`."""
 
     def __init__(self, parameters: PickPlaceParameters) -> None:
         """

@@ -12,7 +12,7 @@ from kitting_drake.station import KittingStation
 from systems.placement import GONE
 
 _NOTHING_TO_DO = ("done", "nothing fits")
-"""The reasons for stopping that claim that no more objects can be placed."""
+"""The policies' reasons for stopping that mean: no more objects can be placed."""
 _UNJUDGED = ("", "interrupted")
 
 

@@ -398,7 +398,7 @@ def _cluttered_table(site: PolicySite) -> ClutteredTable | None:
 
 
 def _ledge(scene: Scene) -> Ledge | None:
-    """The kit's block, over whose edges objects can be turned; None if there is none."""
+    """The kit's block. Objects can be turned over across its edges. None if there is none."""
     for item in scene.fixtures:
         if item.p_FPoints is not None:
             length, width, _ = np.ptp(item.p_FPoints, axis=0).tolist()

@@ -156,7 +156,7 @@ def test_the_hand_s_acceleration_is_that_of_the_joints():
     ("pick", "place", "tilts"),
     [
         ((0.39, 0.31, 1.44), (0.37, -0.13, 1.48), False),
-        # At the place the arm must be in its vertical plane; at the pick it cannot be.
+        # The arm must lie in its vertical plane when it places; when it picks, it cannot.
         ((0.348, 0.008, 1.396), (0.719, -0.166, -1.358), True),
     ],
 )

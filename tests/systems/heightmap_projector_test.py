@@ -252,7 +252,7 @@ def test_flat_ground_reproduces_the_camera_image():
 
 def test_each_pixel_takes_height_and_color_of_its_highest_point():
     depth = FLAT.copy()
-    depth[0, 0] = 0.5  # At x = 0.125, y = 0.15, in pixel (1, 1) of the grid.
+    depth[0, 0] = 0.5  # The point at x = 0.125, y = 0.15, in the grid's pixel (1, 1).
     image = _project((COLOR, depth))
     np.testing.assert_allclose(image[:, 1, 1], [*RGB[0, 0], 0.5], atol=1e-6)
     np.testing.assert_array_equal(image[:, 0, 0], 0)

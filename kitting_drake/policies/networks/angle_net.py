@@ -35,8 +35,8 @@ class AngleNetSize:
     def __post_init__(self) -> None:
         if self.residual and len(self.stages[0]) == 2:
             raise ValueError(
-                "the first stage takes scalars and cannot be a residual block: give it one layer, "
-                "or more than two"
+                "a stage of two layers is a residual block, but the first stage cannot be one, "
+                "because its input is scalars: give it one layer, or more than two"
             )
 
 

@@ -30,7 +30,7 @@ Equivariant Transporter has about as many parameters as ours.
 
 The parameters of the originals come from these sources:
 
-- Our method: the authors' code.
+- The paper's method: counted in its authors' code.
 - The Equivariant Transporter: the paper gives 4.54 M for alpha, and phi and psi are the same U-net.
   The authors' pick-angle network has 0.90 M at N = {ORIENTATIONS}.
 - The Transporter: the paper does not count its parameters. Our preset `paper` has the published

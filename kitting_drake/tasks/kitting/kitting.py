@@ -276,9 +276,8 @@ class _DrawnKitting(KittingTask):
             self.kits > 1 or any(self.riser + self.tilt_deg)
         ):
             raise ValueError(
-                "task.kits, task.riser and task.tilt_deg can be set only if task.start is apart "
-                f"and task.tray is false; task.start is {self.start}, and task.tray is "
-                f"{str(self.tray).lower()}"
+                "task.kits, task.riser and task.tilt_deg need 'start: apart' and 'tray: false', "
+                f"but task.start is '{self.start}' and task.tray is {str(self.tray).lower()}"
             )
 
 
@@ -326,8 +325,8 @@ class Kitting(_DrawnKitting):
             )
         if self.cavities and (self.start != APART or self.tray):
             raise ValueError(
-                "task.cavities can be set only if task.start is apart and task.tray is false; "
-                f"task.start is {self.start}, and task.tray is {str(self.tray).lower()}"
+                "task.cavities needs 'start: apart' and 'tray: false', but task.start is "
+                f"'{self.start}' and task.tray is {str(self.tray).lower()}"
             )
 
 

@@ -46,8 +46,8 @@ class GroupConv2d(ExpandedConv2d):
         elif isinstance(self.out_fibre, Scalar):
             kernel = torch.einsum("oib,nbxy->oxyin", self.weights, self.basis)
         else:
-            # The cyclic shifts of kappa are windows of two successive copies of kappa. The window
-            # of shift m starts at -m.
+            # Write two copies of kappa one after the other. Each cyclic shift of kappa is a window
+            # of the result: the shift by m starts at -m, modulo kappa's length.
             kappa = self.weights.unflatten(2, self.basis.shape[:2])
             cyclic = torch.cat([kappa, kappa], dim=2).unfold(2, len(self.basis), 1)
             kernel = torch.einsum("oimbn,mbxy->omxyin", cyclic[:, :, 1:].flip(2), self.basis)
