@@ -10,7 +10,8 @@ import numpy as np
 from kitting_drake.common.provenance import commit, versions
 from kitting_drake.evaluation.intervals import mean_interval, proportion_interval
 from kitting_drake.scenario.choosing import ChosenScenario
-from systems.placement import STRICT_ANGLE, STRICT_HEIGHT, AddS, SuccessPredicate
+from systems.placement import STRICT_ANGLE, STRICT_HEIGHT, SuccessPredicate
+from systems.success import AddS
 
 Episode = dict[str, Any]
 """A line of `episodes.jsonl`: the result of `EpisodeResult.as_dict`."""

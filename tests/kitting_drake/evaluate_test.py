@@ -27,7 +27,7 @@ from kitting_drake.scenario.choosing import ChosenScenario
 from kitting_drake.scenario.policies import Learned, PythonPolicy
 from kitting_drake.scenario.schema import Heightmap, Scenario
 from kitting_drake.tasks import Kitting
-from systems.placement import AddS
+from systems.success import AddS
 
 CHOSEN = ChosenScenario(Scenario(), Path("mine.yaml"), "mine", None)
 ROOT = Path(__file__).resolve().parents[2]

@@ -10,8 +10,9 @@ from systems.attempt_memory import nearest_grasp
 from systems.grasp import Grasp
 from systems.oracle_policy import OraclePolicy, gripper_pose
 from systems.pick_place_parameters import Mode
-from systems.placement import AddS, Goal, PlacedObject
+from systems.placement import Goal, PlacedObject
 from systems.signals import PickPlaceAction, PlanarPose
+from systems.success import AddS
 
 BOX = np.array([[x, y, z] for x in (-0.05, 0.05) for y in (-0.02, 0.02) for z in (0, 0.02)])
 MIDDLE, END = Grasp(0.0, 0.0, 0.0, 0.04, 0.02), Grasp(0.03, 0.0, 0.0, 0.04, 0.02)

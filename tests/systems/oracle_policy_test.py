@@ -10,8 +10,9 @@ from pydrake.multibody.tree import BodyIndex
 from systems.action_quantizer import ActionQuantizer
 from systems.grasp import Grasp
 from systems.oracle_policy import OraclePolicy, grasp_taken, gripper_pose
-from systems.placement import AddS, Goal, PlacedObject, PoseWithin, SuccessPredicate
+from systems.placement import Goal, PlacedObject, SuccessPredicate
 from systems.signals import PickPlaceAction, PixelGrid, wrap_to_pi
+from systems.success import AddS, PoseWithin
 
 BOX = 0.5 * np.array([[x, y, z] for x in (-0.1, 0.1) for y in (-0.04, 0.04) for z in (0, 0.04)])
 """The corners of a box of 100 x 40 x 20 mm, with the origin at the middle of its bottom."""

@@ -8,8 +8,9 @@ from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.analysis import Simulator
 
 from systems.pick_place_parameters import Mode
-from systems.placement import AddS, Goal, PlacedObject, evaluate_placements
+from systems.placement import Goal, PlacedObject, evaluate_placements
 from systems.placement_monitor import PlacementMonitor
+from systems.success import AddS
 
 POINTS = np.array([[1.0, 1.0, 0.0], [-1.0, 1.0, 0.0], [-1.0, -1.0, 0.0], [1.0, -1.0, 0.0]])
 OBJECTS = [PlacedObject(name, BodyIndex(i + 1), POINTS) for i, name in enumerate("abc")]

@@ -7,18 +7,16 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.tree import BodyIndex
 
 from systems.placement import (
-    AddS,
     Goal,
-    InZone,
     PlacedObject,
     Placement,
-    PoseWithin,
     add_s,
     complete_stages,
     evaluate_placements,
     strict_reward,
     total_reward,
 )
+from systems.success import AddS, InZone, PoseWithin
 
 SQUARE = np.array([[1.0, 1.0, 0.0], [-1.0, 1.0, 0.0], [-1.0, -1.0, 0.0], [1.0, -1.0, 0.0]])
 """The corners of a square with sides of 2, which a quarter rotation maps onto itself."""

@@ -14,7 +14,8 @@ from kitting_drake.hkd.kits.layout import cavity_outline
 from kitting_drake.hkd.kits.seating import find_seat
 from kitting_drake.hkd.tools.tool import Tool
 from kitting_drake.tasks.task import Fixture, Scene, SceneObject
-from systems.placement import AddS, Goal, is_tilted
+from systems.placement import Goal, is_tilted
+from systems.success import AddS
 
 _SURFACE_POINTS = 2000
 

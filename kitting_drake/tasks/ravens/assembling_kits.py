@@ -32,8 +32,9 @@ from kitting_drake.tasks.kitting.tool_poses import draw_poses
 from kitting_drake.tasks.ravens.ravens_task import PoseTask
 from kitting_drake.tasks.task import ActionRecord, Scene
 from systems.bounds import bounded
-from systems.placement import AddS, Placement, PoseWithin
+from systems.placement import Placement
 from systems.signals import PixelGrid
+from systems.success import AddS, PoseWithin
 
 PLACES = ((-0.09, 0.045), (0.0, 0.045), (0.09, 0.045), (-0.045, -0.045), (0.045, -0.045))
 """(x, y) of the cavities in the kit frame, in metres."""

@@ -22,8 +22,9 @@ from kitting_drake.tasks.task import (
     waiting_pose,
 )
 from systems.bounds import bounded
-from systems.placement import GONE, Goal, InZone, Placement
+from systems.placement import GONE, Goal, Placement
 from systems.signals import PixelGrid
+from systems.success import InZone
 
 _BOX = (0.085, 0.04, 0.04)
 _X_WPALLET = RigidTransform([0.5, 0.25, 0.0])

@@ -20,8 +20,9 @@ from kitting_drake.tasks.footprints import Footprint, disc, draw_poses
 from kitting_drake.tasks.ravens.ravens_task import RavensTask, grasp_rng
 from kitting_drake.tasks.task import Fixture, Scene, SceneObject
 from systems.bounds import bounded
-from systems.placement import Goal, PoseWithin
+from systems.placement import Goal
 from systems.signals import PixelGrid
+from systems.success import PoseWithin
 
 _BOWL = Footprint((disc(0.06),))
 _DISTRACTOR_CUBE = Footprint(CUBE_FOOTPRINT.body)

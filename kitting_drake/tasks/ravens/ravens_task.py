@@ -11,7 +11,8 @@ from pydrake.math import RigidTransform
 from kitting_drake.policies.data.learning import Learning
 from kitting_drake.tasks.task import MISPLACED, ActionRecord, Scene, TaskConfig
 from systems.bounds import bounded
-from systems.placement import Placement, PoseWithin
+from systems.placement import Placement
+from systems.success import PoseWithin
 
 TOPPLED = "toppled"
 PREREQUISITE_MISSING = "prerequisite missing"

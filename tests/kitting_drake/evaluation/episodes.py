@@ -8,8 +8,8 @@ from kitting_drake.episode.episode import ObjectResult
 from kitting_drake.scenario.choosing import ChosenScenario
 from kitting_drake.scenario.schema import Scenario
 from kitting_drake.tasks.task import MISPLACED, ActionRecord, PeakForce
-from systems.placement import AddS
 from systems.signals import PlanarPose
+from systems.success import AddS
 
 CHOSEN = ChosenScenario(Scenario(), Path("mine.yaml"), "mine", None)
 ADD_S = AddS(0.0035)

@@ -8,7 +8,8 @@ from PIL import Image
 
 from kitting_drake.evaluation.summary import summarise
 from kitting_drake.evaluation.summary_figure import _COLOURS, _looks, draw_summary
-from systems.placement import PoseWithin, SuccessPredicate
+from systems.placement import SuccessPredicate
+from systems.success import PoseWithin
 from tests.kitting_drake.evaluation.episodes import (
     ADD_S,
     CHOSEN,

@@ -8,7 +8,7 @@ from kitting_drake.evaluation.summary import summarise
 from kitting_drake.evaluation.terminal import summary_notes
 from kitting_drake.scenario.schema import Scenario
 from kitting_drake.tasks import StackBlockPyramid
-from systems.placement import PoseWithin
+from systems.success import PoseWithin
 from tests.kitting_drake.evaluation.episodes import (
     ADD_S,
     CHOSEN,
