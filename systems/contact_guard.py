@@ -119,7 +119,8 @@ class ContactGuard:
         lateral = math.hypot(side_x, side_y)
         state.recent[3:] = state.recent[:-3].copy()
         state.recent[:3] = side_x, side_y, vertical
-        mean = state.recent[: 3 * self._samples].reshape(-1, 3).mean(axis=0).tolist()
+        total = np.add.reduce(state.recent[: 3 * self._samples].reshape(-1, 3)).tolist()
+        mean = [component / self._samples for component in total]
         self._keep_peaks(state, abs(mean[2]), math.hypot(*mean[:2]))
         push = max(-vertical, 0.0) if mode in _RISES else abs(vertical)
         if mode == Mode.DESCEND and state.press:
