@@ -31,7 +31,10 @@ API = {
             "kitting_drake.hkd.kits.parameters",
         ],
     ),
-    "tasks": ("The contract of a task", ["kitting_drake.tasks.task", "systems.placement"]),
+    "tasks": (
+        "The contract of a task",
+        ["kitting_drake.tasks.task", "systems.placement", "systems.success"],
+    ),
     "policies": (
         "Policies",
         [

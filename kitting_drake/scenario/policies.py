@@ -180,6 +180,7 @@ class Learned(PolicyConfig):
 
     # Whether to refine actions by the geometry of the observation o_t. Needs `continuous`. The
     # paper's policy has none of these refinements:
+    #
     # - The place: fit the object's outline to that of the recess, if the two agree.
     # - The pick: move the grasp to where the jaws have clearance.
     # - Touching objects: separate them by the outlines of the empty recesses.
