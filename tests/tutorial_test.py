@@ -1,7 +1,9 @@
 """The cells of docs/tutorial.ipynb run one after another, and the notebook stores no outputs."""
 
+import ast
 import json
 import os
+import re
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -29,6 +31,19 @@ def test_the_cells_are_short_and_compile_and_store_no_outputs():
         assert cell["execution_count"] is None
         assert len(cell["source"]) <= 30
         compile(source(cell), f"cell {number}", "exec")
+
+
+def test_the_imports_of_the_cells_work():
+    for cell in code_cells():
+        for statement in ast.parse(source(cell)).body:
+            if isinstance(statement, ast.Import | ast.ImportFrom):
+                exec(ast.unparse(statement), {})
+
+
+def test_the_pictures_exist():
+    pictures = re.findall(r"!\[[^\]]+\]\(([^)]+)\)", NOTEBOOK.read_text())
+    assert len(pictures) == 3
+    assert all((NOTEBOOK.parent / picture).is_file() for picture in pictures)
 
 
 @pytest.mark.slow
