@@ -27,7 +27,8 @@ def scenario_parser(command: str, description: str) -> argparse.ArgumentParser:
         "--output",
         type=Path,
         metavar="DIR",
-        help="folder for all files (default: a subfolder of output/, named after the scenario)",
+        help="folder for all files without a path of their own (default: a subfolder of output/, "
+        "named after the scenario)",
     )
     parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
     return parser

@@ -6,6 +6,8 @@ Drake's own configs.
 
 Units are SI. Names of fields in degrees end in `_deg`.
 
+`bounded(d, a, b)`: default d, allowed from a to b.
+
 The table's top is the plane z = 0 of the world. No field changes it; see `models/table/table.sdf`.
 The fingers' geometry is in `models/franka_hand/`, its dimensions in `systems/hand_geometry.py`.
 """
