@@ -61,6 +61,9 @@ def _check_union(schema: Any, value: Any, where: str) -> None:
         if type(None) in typing.get_args(schema):
             return
         raise ValueError(f"{where} is empty: give a value or leave the field out")
+    known = [option.__name__ for option in options]
+    if len(options) > 1 and value in known:
+        raise ValueError(f"{where} must be a mapping, not {_shown(value)}: write !{value} {{}}")
     if len(options) == 1 or not isinstance(value, dict):
         check_yaml(options[0], value, where)
         return
@@ -75,8 +78,10 @@ def _check_union(schema: Any, value: Any, where: str) -> None:
             else:
                 _check_struct(option, value, where)
             return
-    known = ", ".join(f"!{option.__name__}" for option in options)
-    raise ValueError(f"{where} has the unknown tag !{tag}: use one of {known}")
+    close = difflib.get_close_matches(tag, known, n=1)
+    every = ", ".join(f"!{name}" for name in known)
+    advice = f"did you mean !{close[0]}?" if close else f"use one of {every}"
+    raise ValueError(f"{where} has the unknown tag !{tag}: {advice}")
 
 
 def _check_dataclass(schema: Any, value: Any, where: str) -> None:

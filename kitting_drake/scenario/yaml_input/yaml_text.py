@@ -13,6 +13,7 @@ from kitting_drake.common.errors import UserError
 _Composer = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 _TEXT, _MERGE = "tag:yaml.org,2002:str", "tag:yaml.org,2002:merge"
+_NULL = "tag:yaml.org,2002:null"
 
 
 class _Dumper(yaml.SafeDumper):
@@ -59,6 +60,8 @@ def parse(content: str, where: str) -> dict:
         mark = getattr(error, "problem_mark", None)
         line = f", line {mark.line + 1}" if mark else ""
         problem = getattr(error, "problem", None) or "it cannot be parsed"
+        if getattr(error, "context", None) == "while scanning a tag":
+            problem = "a tag needs a space and a mapping behind it, as in !Oracle {}"
         raise UserError(f"{where}{line} is not YAML: {problem}") from error
     except ValueError as error:
         raise UserError(f"{where}: {error}") from error
@@ -90,6 +93,11 @@ def _checked(content: str) -> Any:
 
 
 def _check_names(node: yaml.Node | None) -> None:
+    if node is not None and not isinstance(node, yaml.MappingNode) and node.tag.startswith("!"):
+        line = node.start_mark.line + 1
+        raise ValueError(
+            f"the tag {node.tag} on line {line} needs a mapping: write {node.tag} {{}}"
+        )
     if isinstance(node, yaml.MappingNode):
         seen = set()
         for key, value in node.value:
@@ -97,6 +105,10 @@ def _check_names(node: yaml.Node | None) -> None:
             _check_names(value)
             if key.tag == _MERGE:
                 continue
+            if key.tag != _TEXT and value.tag == _NULL and not value.value:
+                raise ValueError(
+                    f"'{key.value}' on line {line} has no name: a list needs brackets, as in [1, 2]"
+                )
             if key.tag != _TEXT:
                 raise ValueError(f"the name on line {line} must be a string")
             if key.value == "_tag":

@@ -46,7 +46,9 @@ def test_accepts(value: Any):
     ("value", "message"),
     [
         ({"bottoms": [{}, {"side": 1.0}]}, r"^bottoms\[1\]\.side is an unknown field"),
-        ({"lid": {"_tag": "!Sqare"}}, "^lid has the unknown tag !Sqare: use one of !Round, !Squa"),
+        ({"lid": {"_tag": "!Sqare"}}, "^lid has the unknown tag !Sqare: did you mean !Square.$"),
+        ({"lid": {"_tag": "!Oval"}}, "^lid has the unknown tag !Oval: use one of !Round, !Square$"),
+        ({"lid": "Square"}, "^lid must be a mapping, not 'Square': write !Square {}$"),
         ({"lid": {"_tag": 3}}, "^lid has a tag that is not a name: '3'$"),
         ({"lid": {"_tag": "!Square", "radius": 1.0}}, r"^lid\.radius is an unknown field"),
         ({"lid": None}, "^lid is empty"),
