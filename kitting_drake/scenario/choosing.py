@@ -12,7 +12,7 @@ from kitting_drake.common.files import files_digest
 from kitting_drake.common.paths import SCENARIOS
 from kitting_drake.common.provenance import versions
 from kitting_drake.scenario.description import describe
-from kitting_drake.scenario.loader import load_scenario
+from kitting_drake.scenario.loader import load_scenario, scenario_names
 from kitting_drake.scenario.perturbations import LEVELS, NAMES
 from kitting_drake.scenario.schema import Scenario
 
@@ -110,17 +110,26 @@ class ChosenScenario:
 
 
 def choose_scenario(arguments: argparse.Namespace) -> ChosenScenario:
-    """Loads the scenario that the flags of `scenario_parser` select.
+    """Loads the scenario that the flags of `scenario_parser` select. If the file has several and
+    no name is given, prints the names.
 
     Raises:
         UserError: the file cannot be read, or a field is invalid.
     """
-    return find_scenario(
+    chosen = find_scenario(
         arguments.scenario,
         arguments.scenario_name,
         arguments.scenario_text,
         arguments.perturb,
     )
+    if arguments.scenario_name is None and not arguments.quiet:
+        first, *others = scenario_names(chosen.path)
+        if others:
+            print(
+                f"note: {chosen.path} has several scenarios, and this is {first}: "
+                f"for {' or '.join(others)} give --scenario_name"
+            )
+    return chosen
 
 
 def find_scenario(

@@ -42,14 +42,8 @@ def load_scenario(
     Raises:
         UserError: the file cannot be read, or a field is invalid.
     """
-    try:
-        content = path.read_text()
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "it is not a text file"
-        raise UserError(f"cannot read the scenario {path}: {reason}") from error
-    root = parse(content, str(path))
-    # Names with these beginnings hold YAML anchors by convention. They are not scenarios.
-    names = [name for name in root if not name.startswith(("x-", "."))]
+    root = _read(path)
+    names = _names(root)
     fields = {item.name for item in dc.fields(Scenario)}
     if names and not set(names) - fields:
         raise UserError(
@@ -81,12 +75,38 @@ def load_scenario(
     return scenario
 
 
+def scenario_names(path: Path) -> list[str]:
+    """The names of the scenarios in a YAML file.
+
+    Raises:
+        UserError: the file cannot be read.
+    """
+    return _names(_read(path))
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        content = path.read_text()
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "it is not a text file"
+        raise UserError(f"cannot read the scenario {path}: {reason}") from error
+    return parse(content, str(path))
+
+
+def _names(root: dict[str, Any]) -> list[str]:
+    # Names with these beginnings hold YAML anchors by convention. They are not scenarios.
+    return [name for name in root if not name.startswith(("x-", "."))]
+
+
 def _onto(raw: dict, defaults: Scenario) -> tuple[dict, Scenario]:
     """Returns the YAML and the defaults, prepared for merging.
 
     Drake reads an untagged mapping as the first type of a union. This function therefore adds the
     tag of the default's type. If the YAML selects another type of task, each mapping in it replaces
     the default mapping of the new type. Cameras that are null in the YAML are removed from both.
+
+    Raises:
+        UserError: a camera that is null does not exist.
     """
     tagged = dict(raw)
     for name in ("task", "policy", "robot"):
@@ -99,6 +119,12 @@ def _onto(raw: dict, defaults: Scenario) -> tuple[dict, Scenario]:
     if isinstance(cameras, dict):
         kept = {name: camera for name, camera in cameras.items() if camera is not None}
         removed = cameras.keys() - kept.keys()
+        if unknown := removed - defaults.cameras.keys():
+            known = ", ".join(defaults.cameras)
+            raise UserError(
+                f"--scenario_text: there is no camera '{min(unknown)}' to remove: "
+                + (f"use one of {known}" if known else "the scenario has none")
+            )
         left = {name: item for name, item in defaults.cameras.items() if name not in removed}
         defaults = dc.replace(defaults, cameras=left)
         tagged["cameras"] = _of_variants(kept, left)

@@ -76,6 +76,20 @@ def test_shipped_scenarios_are_found_from_anywhere(tmp_path: Path, monkeypatch: 
         assert choose_scenario(parse(path)).path == SCENARIOS / "paper" / "kitting_seen.yaml"
 
 
+def test_the_other_scenarios_of_a_file_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    path = write(tmp_path, "A: {}\nx-common: {}\nB: {}\nC: {}\n")
+    assert choose_scenario(parse(path)).name == "mine"
+    assert capsys.readouterr().out == (
+        f"note: {path} has several scenarios, and this is A: for B or C give --scenario_name\n"
+    )
+    choose_scenario(parse(path, "--scenario_name", "B"))
+    choose_scenario(parse(path, "--quiet"))
+    choose_scenario(parse(write(tmp_path, "A: {}\nx-common: {}\n")))
+    assert capsys.readouterr().out == ""
+
+
 def test_output_folder():
     assert output_folder(parse("a.yaml", "--output", "here"), "a:B") == Path("here")
     assert output_folder(parse("a.yaml"), "a:B") == Path("output/a-B")

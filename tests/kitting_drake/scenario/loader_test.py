@@ -171,7 +171,15 @@ BAD = {
         ["planner.firm_grasp_force is 70 N", "50 N", "finger_force_limit"],
     ),
     "unknown tag": ("A: {policy: !Orcle {}}", ["policy", "!Orcle", "!Oracle"]),
-    "tag without a value": ("A: {policy: !Oracle }", ["mine.yaml"]),
+    "tag without a value": (
+        "A:\n  policy: !Oracle\n",
+        ["mine.yaml: the tag !Oracle on line 2 needs a mapping: write !Oracle {}"],
+    ),
+    "tag before a brace": ("A: {policy: !Oracle}", ["mine.yaml, line 1", "as in !Oracle {}"]),
+    "list without brackets": (
+        "A: {planner: {home: -0.4, 0, 0.4, 0}}",
+        ["mine.yaml: '0' on line 1 has no name: a list needs brackets, as in [1, 2]"],
+    ),
     "empty value": ("A: {time_limit: }", ["time_limit", "empty"]),
     "empty section": ("A: {planner: }", ["planner", "empty"]),
     # Values of a wrong type.
@@ -183,7 +191,7 @@ BAD = {
     "text for a list": ("A: {task: !Kitting {tools: hammer}}", ["task.tools", "list"]),
     "number among strings": ("A: {task: !Kitting {tools: [1]}}", ["task.tools[0]", "string"]),
     "list for a mapping": ("A: {cameras: [1]}", ["cameras", "mapping"]),
-    "text for a section": ("A: {policy: Oracle}", ["policy", "mapping"]),
+    "text for a section": ("A: {policy: Oracle}", ["policy", "mapping", "write !Oracle {}"]),
     # Values that are not allowed.
     "out of range": ("A: {planner: {grasp_force: 1000.0}}", ["planner.grasp_force", "1 and 140"]),
     "out of range in a map": ("A: {cameras: {f: !Pinhole {width: 1}}}", ["cameras.f.width"]),
@@ -286,6 +294,16 @@ def test_errors_in_scenario_text_name_the_flag():
         load_scenario(TEST_SCENARIOS, text="faster")
     with pytest.raises(UserError, match=r"^--scenario_text: '_tag' on line 1 is not a field"):
         load_scenario(TEST_SCENARIOS, text="{task: {_tag: 5}}")
+
+
+def test_only_a_camera_of_the_scenario_can_be_removed():
+    with pytest.raises(UserError) as caught:
+        load_scenario(TEST_SCENARIOS, text="{cameras: {lft: null}}")
+    assert str(caught.value) == (
+        "--scenario_text: there is no camera 'lft' to remove: use one of front, left, right"
+    )
+    left = load_scenario(TEST_SCENARIOS, text="{cameras: {left: null}}")
+    assert list(left.cameras) == ["front", "right"]
 
 
 def test_the_merged_scenario_is_validated(tmp_path: Path):
