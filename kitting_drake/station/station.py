@@ -31,7 +31,7 @@ from kitting_drake.station.robot import (
 )
 from kitting_drake.station.scene_reach import check_scene_reach
 from kitting_drake.station.sensing import add_cameras
-from kitting_drake.tasks.task import Scene
+from kitting_drake.tasks.task import TABLE, Scene
 from systems.object_feeder import ObjectFeeder
 from systems.pick_place_parameters import Mode
 from systems.placement import GONE, PlacedObject, Placement
@@ -428,7 +428,11 @@ def build_station(
 
 
 def _check_scene(scenario: Scenario, scene: Scene) -> None:
-    """Raises UserError if an object is too high for the heightmap or too wide for the jaws."""
+    """Raises UserError if a task makes no scene, or if an object or a goal is off the table, too
+    high for the heightmap or too wide for the jaws."""
+    if not isinstance(scene, Scene):
+        raise UserError(f"task: make_scene must return a Scene, but returns {scene!r}")
+    _check_on_table(scene)
     tops = {item.name: float((item.X_WB @ item.p_BPoints.T)[2].max()) for item in scene.objects}
     tops |= {goal.name: goal.rim_height for goal in scene.goals if goal.rim_height is not None}
     name, top = max(tops.items(), key=lambda pair: pair[1])
@@ -444,6 +448,31 @@ def _check_scene(scenario: Scenario, scene: Scene) -> None:
             raise UserError(
                 f"planner.open_width is {scenario.planner.open_width:g}, too narrow for {item.name}"
                 f": set more than {narrowest:.3f}"
+            )
+
+
+def _check_on_table(scene: Scene) -> None:
+    poses = [item.X_WB for item in scene.objects]
+    if scene.arrivals is not None:
+        for index, X_WB in zip(scene.arrivals.objects, scene.arrivals.poses, strict=True):
+            poses[index] = X_WB
+    middles = [item.p_BPoints.mean(axis=0) for item in scene.objects]
+    things = [
+        (f"the object '{item.name}'", X_WB @ middle)
+        for item, X_WB, middle in zip(scene.objects, poses, middles, strict=True)
+    ]
+    things += [
+        (f"the goal '{goal.name}'", X_WGoal @ middles[index])
+        for goal in scene.goals
+        for index in goal.objects
+        for X_WGoal in goal.poses
+    ]
+    low, high = TABLE
+    for name, (x, y, _) in things:
+        if not (low[0] <= x <= high[0] and low[1] <= y <= high[1]):
+            raise UserError(
+                f"{name} at ({x:.2f}, {y:.2f}) m is not on the table: choose x from {low[0]:g} to "
+                f"{high[0]:g} m and y from {low[1]:g} to {high[1]:g} m"
             )
 
 

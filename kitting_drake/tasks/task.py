@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
+from kitting_drake.common.errors import UserError
 from kitting_drake.policies.data.learning import Learning
 from systems.grasp import Grasp
 from systems.placement import Goal, Placement, SuccessPredicate
@@ -97,7 +98,12 @@ def waiting_pose(index: int) -> RigidTransform:
 
 @dataclass(frozen=True)
 class Scene:
-    """The initial state of an episode, and its goals."""
+    """The initial state of an episode, and its goals.
+
+    Raises:
+        UserError: a name is given twice, a goal's index is out of range, or the goals' rewards do
+            not add up to 1.
+    """
 
     objects: tuple[SceneObject, ...]
     fixtures: tuple[Fixture, ...]
@@ -117,8 +123,21 @@ class Scene:
 
     def __post_init__(self) -> None:
         names = [item.name for item in self.objects] + [item.name for item in self.fixtures]
-        assert len(set(names)) == len(names), f"names must be unique: {names}"
-        assert abs(sum(goal.reward for goal in self.goals) - 1) < 1e-9
+        if twice := [name for name in names if names.count(name) > 1]:
+            raise UserError(f"the name '{twice[0]}' is given to several objects or fixtures")
+        for goal in self.goals:
+            for what, indices, count in (
+                ("object", goal.objects, len(self.objects)),
+                ("goal", goal.after, len(self.goals)),
+            ):
+                if wrong := [index for index in indices if not 0 <= index < count]:
+                    raise UserError(
+                        f"the goal '{goal.name}' refers to {what} {wrong[0]}, but the indices of "
+                        f"{what}s are 0 to {count - 1}"
+                    )
+        total = sum(goal.reward for goal in self.goals)
+        if not abs(total - 1) < 1e-9:
+            raise UserError(f"the goals' rewards must add up to 1, not {total:.10g}")
 
     @property
     def goal_objects(self) -> tuple[int, ...]:

@@ -4,11 +4,13 @@ import shutil
 import weakref
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from pydrake.common.value import Value
+from pydrake.math import RigidTransform
 from pydrake.multibody.math import SpatialVelocity
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, EventStatus
@@ -33,13 +35,15 @@ from kitting_drake.scenario.robots import FloatingHand, FrankaArm, Robot
 from kitting_drake.scenario.schema import Sleep
 from kitting_drake.station import build_station, make_policy
 from kitting_drake.tasks import Kitting
+from kitting_drake.tasks.boxes import COLOURS, box_object
 from kitting_drake.tasks.ravens.palletizing_boxes import PalletizingBoxes
-from kitting_drake.tasks.task import TABLE
+from kitting_drake.tasks.task import TABLE, Scene, TaskConfig
 from systems.hand_geometry import JOINT_LIMITS
 from systems.pick_place_parameters import PickPlaceParameters
-from systems.placement import Placement
+from systems.placement import Goal, Placement
 from systems.sensor_noise import SensorNoiseParameters
-from systems.signals import Observation
+from systems.signals import Observation, PixelGrid
+from systems.success import PoseWithin
 from tests.kitting_drake.rig import Rig, build_rig
 
 BASE = Path(__file__).parent
@@ -406,6 +410,68 @@ def test_invalid_scenarios_raise(text: str, sentence: str):
     scenario = load_scenario(SCENARIOS / "paper/kitting_seen.yaml", text=text)
     with pytest.raises(UserError, match=sentence):
         build(scenario)
+
+
+# Own scenes that are invalid.
+
+
+@dataclasses.dataclass
+class Cube(TaskConfig):
+    """A cube at x that should be at `goal_x`."""
+
+    x: float = 0.5
+    goal_x: float = 0.6
+    object: int = 0
+    after: int | None = None
+    reward: float = 1.0
+    name: str = "cube"
+    returns: bool = True
+
+    def make_scene(self, *, grid: PixelGrid, seed: int, base: Path) -> Any:
+        cubes = tuple(
+            box_object(name, "cube", (0.04,) * 3, COLOURS["red"], RigidTransform([self.x, y, 0]))
+            for name, y in (("cube", 0.1), (self.name, -0.1))
+        )
+        after = () if self.after is None else (self.after,)
+        pose = RigidTransform([self.goal_x, 0.1, 0])
+        goal = Goal("here", (self.object,), (pose,), self.reward, after=after)
+        scene = Scene(cubes, (), (goal,), PoseWithin(), max_actions=2)
+        return scene if self.returns else None
+
+
+OFF = "is not on the table: choose x from 0 to 1 m and y from -0.75 to 0.75 m"
+
+
+@pytest.mark.parametrize(
+    ("task", "sentence"),
+    [
+        (Cube(name="other"), None),
+        (Cube(), "the name 'cube' is given to several objects or fixtures"),
+        (Cube(name="other", reward=0.5), "the goals' rewards must add up to 1, not 0.5"),
+        (
+            Cube(name="other", object=2),
+            "the goal 'here' refers to object 2, but the indices of objects are 0 to 1",
+        ),
+        (
+            Cube(name="other", after=-1),
+            "the goal 'here' refers to goal -1, but the indices of goals are 0 to 0",
+        ),
+        (
+            Cube(name="other", returns=False),
+            "task: make_scene must return a Scene, but returns None",
+        ),
+        (Cube(name="other", x=1.2), f"the object 'cube' at (1.20, 0.10) m {OFF}"),
+        (Cube(name="other", goal_x=-0.1), f"the goal 'here' at (-0.10, 0.10) m {OFF}"),
+    ],
+)
+def test_an_invalid_scene_of_an_own_task_raises(task: Any, sentence: str | None):
+    scenario = dataclasses.replace(BLIND, task=task)
+    if sentence is None:
+        build_station(scenario)
+        return
+    with pytest.raises(UserError) as caught:
+        build_station(scenario)
+    assert str(caught.value) == sentence
 
 
 # Unusable models.
