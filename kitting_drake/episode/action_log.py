@@ -88,9 +88,7 @@ class ActionLog:
             self.records[-1].outcome = by_mode.get(event.previous, "dropped")
 
     def _note_set_down(self, event: ModeChange) -> None:
-        station = self._station
-        context = station.GetMyContextFromRoot(event.root_context)
-        history = station.GetOutputPort("history").Eval(context)
+        history = self._station.history(event.root_context)
         if history and history[-1].outcome == "set down" and self.records:
             self.records[-1].outcome = "set down"
 

@@ -84,7 +84,8 @@ def is_right(reason: str, station: KittingStation, root_context: Context) -> boo
     - `done`: right if nothing is left to do.
     - `nothing fits`: right if an object or a goal is left, but no object fits an unfilled goal.
     - All others (`gave up`, `not sure`, `not seen`, `no kit seen`, `actions spent`, `time`,
-      `failure`): right if something is left to do.
+      `failure`): right if something is left to do. `actions spent` is also right if the last
+      action filled the last goal, because the policy is not asked again.
 
     Args:
         reason: a value of `stop_reason`.
@@ -99,6 +100,9 @@ def is_right(reason: str, station: KittingStation, root_context: Context) -> boo
     loose, free = _loose_and_free(station, root_context)
     goals = station.scene.goals
     is_left = any(index in goals[goal].objects for goal in free for index in loose)
+    if reason == "actions spent" and not free:
+        history = station.history(root_context)
+        return bool(history) and history[-1].outcome in ("placed", "pressed")
     if reason not in _NOTHING_TO_DO:
         return is_left
     return not is_left and (reason == "done" or bool(loose or free))

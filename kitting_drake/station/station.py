@@ -37,7 +37,7 @@ from systems.pick_place_parameters import Mode
 from systems.placement import GONE, PlacedObject, Placement
 from systems.placement_monitor import PlacementMonitor
 from systems.rest_detector import RestDetector
-from systems.signals import Observation, PickPlaceAction
+from systems.signals import Attempt, Observation, PickPlaceAction
 
 Monitor = Callable[[Context], EventStatus]
 """A monitor of a Simulator: called after each step, with the root context."""
@@ -270,6 +270,10 @@ class KittingStation(Diagram):
     def point_contact_pairs(self, root_context: Context) -> int:
         """Number of pairs in point contact; 0 if contact is strictly hydroelastic."""
         return self._eval(root_context, "contact_results").num_point_pair_contacts()
+
+    def history(self, root_context: Context) -> tuple[Attempt, ...]:
+        """The port `history`: the last actions with a known outcome, oldest first."""
+        return self._eval(root_context, "history")
 
     def proposed_action(self, root_context: Context) -> PickPlaceAction:
         """The port `action`: the connected policy's present action."""

@@ -8,7 +8,7 @@ from pydrake.multibody.tree import BodyIndex
 
 from kitting_drake.episode.ending import Position, find_left_over, is_right
 from systems.placement import Goal, PlacedObject, Placement
-from systems.signals import LeftOver, PickPlaceAction
+from systems.signals import Attempt, LeftOver, PickPlaceAction
 
 STOP = PickPlaceAction(stop=True, reason="done")
 POINTS = np.array([[0.0, 0.0, 0.0], [0.02, 0.02, 0.02]])
@@ -22,6 +22,8 @@ class Cell:
     filled: tuple[int | None, ...]
     action: PickPlaceAction = STOP
     kept: frozenset[int] = frozenset()
+    last: str = "missed"
+    """The outcome of the last action."""
 
     @property
     def scene(self) -> Any:
@@ -44,6 +46,9 @@ class Cell:
     def accepted_action(self, _: object) -> PickPlaceAction:
         return self.action
 
+    def history(self, _: object) -> tuple[Attempt, ...]:
+        return (Attempt(PickPlaceAction(), "placed"), Attempt(PickPlaceAction(), self.last))
+
     def kept_goals(self, _: object) -> frozenset[int]:
         return self.kept
 
@@ -64,10 +69,12 @@ KEPT = Cell((goal(0), goal(1)), (0, None), kept=frozenset({1}))
     [
         (ONE_LEFT, {"gave up", "not sure", "not seen", "actions spent", "time", "failure"}),
         (ALL_PLACED, {"done"}),
+        (dataclasses.replace(ALL_PLACED, last="placed"), {"done", "actions spent"}),
+        (dataclasses.replace(ONE_LEFT, filled=(0,), last="placed"), {"done", "nothing fits"}),
         (FOREIGN, {"done", "nothing fits"}),
         (KEPT, {"done", "nothing fits"}),
     ],
-    ids=["one left", "all placed", "foreign", "kept"],
+    ids=["one left", "all placed", "all placed at last", "a cavity left", "foreign", "kept"],
 )
 def test_a_reason_is_judged_by_the_true_state(cell: Any, right: set[str]):
     reasons = ["done", "nothing fits", "gave up", "not sure", "not seen", "actions spent"]
