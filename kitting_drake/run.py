@@ -93,7 +93,10 @@ def main() -> int:
     if video is not None:
         video.Save()
     print_episode(console, result)
-    console.print(f"files: {folder}/", highlight=False, markup=False)
+    named = (arguments.log, arguments.picture, arguments.video, arguments.graphviz)
+    elsewhere = [str(path) for path in named if path is not None and folder not in path.parents]
+    files = ", ".join([f"{folder}/", *elsewhere])
+    console.print(f"files: {files}", highlight=False, markup=False, soft_wrap=True)
     if result.failure:
         return FAILED
     return INTERRUPTED if result.interrupted else 0

@@ -122,6 +122,14 @@ def test_shipped_scenarios_run(
         assert system in diagram.read_text()
 
 
+def test_files_outside_the_folder_are_named(verb: Verb, tmp_path: Path):
+    out, log, diagram = tmp_path / "out", tmp_path / "log.npz", tmp_path / "out" / "kitting.dot"
+    flags = ("--scenario_text", "{time_limit: 0.1}", "--no-meshcat", "--output", out)
+    done = verb("run", "scenarios/kitting_oracle.yaml", *flags, "--log", log, "--graphviz", diagram)
+    assert done.returncode == 0
+    assert done.stdout.endswith(f"files: {out}/, {log}\n")
+
+
 def test_quiet_prints_nothing(verb: Verb, tmp_path: Path):
     flags = ("--scenario_text", "{time_limit: 0.1}", "--no-meshcat", "--output", tmp_path)
     done = verb("run", "scenarios/kitting_oracle.yaml", "--quiet", *flags)
