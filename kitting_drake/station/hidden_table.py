@@ -1,4 +1,4 @@
-"""Checks whether the waiting robot hides part of the table from a camera."""
+"""Checks whether the cameras see the table, and whether the waiting robot hides part of it."""
 
 import itertools
 
@@ -27,12 +27,15 @@ _YAWS = np.deg2rad([0.0, 45.0, 90.0, 135.0])
 _PLACES = 9
 """Number of waiting positions to check along the workspace's y axis, because the hand may wait at
 any y."""
+_GRID = 100
+"""Number of points to check along each side of the workspace."""
 _BORDER = 0.015
 """A border of the workspace of this width, in m, may be hidden: no object fits into it."""
 
 
 def hidden_table_note(scenario: Scenario) -> str | None:
-    """Returns a warning if the waiting robot hides part of the workspace from a camera; else None.
+    """Returns a warning if no camera looks at the workspace, or if the waiting robot hides part of
+    it from a camera; else None.
 
     Unless another camera sees the hidden part, it is a hole in o_t.
 
@@ -40,6 +43,9 @@ def hidden_table_note(scenario: Scenario) -> str | None:
         ValueError: an arm cannot reach the home pose.
     """
     grid = scenario.heightmap.grid()
+    cameras = scenario.cameras.values()
+    if cameras and not any(_looks_at(grid, camera) for camera in cameras):
+        return "the cameras see 0 % of the workspace: turn them towards the table"
     x, y, z, yaw = scenario.planner.home
     along_y = [y, *np.linspace(grid.y_min, grid.y_max, _PLACES).tolist()]
     robot, arm = scenario.robot, np.empty((0, 3))
@@ -93,8 +99,17 @@ def _waiting_arm(scenario: Scenario, robot: FrankaArm, along_y: list[float]) -> 
     return np.concatenate([link_points(q, robot.arm_base()) for q in postures])
 
 
-def _hides(p_WPoints: NDArray[np.float64], camera: Camera, grid: PixelGrid) -> bool:
-    """Whether any of the points hides a part of the workspace from a camera."""
+def _looks_at(grid: PixelGrid, camera: Camera) -> bool:
+    """Whether any part of the workspace is in a camera's image."""
+    x, y = np.meshgrid(
+        np.linspace(grid.x_min, grid.x_max, _GRID), np.linspace(grid.y_min, grid.y_max, _GRID)
+    )
+    p_WTable = np.stack([x.ravel(), y.ravel(), np.full(x.size, grid.z_min)], axis=1)
+    return bool(_is_in_image(p_WTable, camera).any())
+
+
+def _is_in_image(p_WPoints: NDArray[np.float64], camera: Camera) -> NDArray[np.bool_]:
+    """Whether each of the points (n, 3) is in a camera's image."""
     X_WC = camera_pose(camera)
     lens = depth_camera(camera, "").core().intrinsics()
     x, y, z = X_WC.inverse().multiply(p_WPoints.T)
@@ -102,8 +117,13 @@ def _hides(p_WPoints: NDArray[np.float64], camera: Camera, grid: PixelGrid) -> b
     depth = np.where(ahead, z, 1.0)
     u = lens.focal_x() * x / depth + lens.center_x()
     v = lens.focal_y() * y / depth + lens.center_y()
-    in_image = ahead & (u > 0) & (u < lens.width()) & (v > 0) & (v < lens.height())
-    p_WC = X_WC.translation()
+    return ahead & (u > 0) & (u < lens.width()) & (v > 0) & (v < lens.height())
+
+
+def _hides(p_WPoints: NDArray[np.float64], camera: Camera, grid: PixelGrid) -> bool:
+    """Whether any of the points hides a part of the workspace from a camera."""
+    in_image = _is_in_image(p_WPoints, camera)
+    p_WC = camera_pose(camera).translation()
     rays = p_WPoints - p_WC
     # Intersect each downward ray with the table.
     down = in_image & (rays[:, 2] < -1e-6)

@@ -16,6 +16,17 @@ def test_the_default_cameras_do_not_see_the_waiting_hand():
     assert hidden_table_note(Scenario()) is None
 
 
+def test_cameras_that_see_none_of_the_workspace():
+    up = LookAt(position=[0.5, 0.0, 0.75], target=[0.6, 0.0, 2.0])
+    blind = Scenario(cameras={"up": up})
+    assert hidden_table_note(blind) == (
+        "the cameras see 0 % of the workspace: turn them towards the table"
+    )
+    assert hidden_table_note(Scenario(cameras={})) is None
+    seeing = dataclasses.replace(blind, cameras={**Scenario().cameras, "up": up})
+    assert hidden_table_note(seeing) is None
+
+
 @pytest.mark.parametrize("camera", [ABOVE, LookAt(position=[0.5, 0.01, 1.1])])
 def test_an_overhead_camera_sees_the_waiting_hand_at_the_default_home(camera: Pinhole | LookAt):
     scenario = Scenario()
