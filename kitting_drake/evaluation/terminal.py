@@ -117,12 +117,13 @@ def _print_measures(console: Console, result: EpisodeResult) -> None:
 
 def summary_table(summary: dict[str, Any]) -> Table:
     """The table of a summary, with a row for each category. The columns `strict` and
-    `success` count objects."""
+    `success` count objects; the others are medians."""
     table = Table(title=_summary_title(summary), title_justify="left")
-    table.add_column("category", no_wrap=True)
-    for heading in ("strict", "success", "ADD-S mm", "95 %", *_ERROR_HEADINGS[1:]):
-        # In a narrow terminal, break headings only between words.
-        table.add_column(heading, justify="right", min_width=max(map(len, heading.split())))
+    # In a narrow terminal, break long names, so that the right border stays visible.
+    table.add_column("category", overflow="fold")
+    for heading in ("strict", "success", *_ERROR_HEADINGS):
+        words = heading.split()
+        table.add_column("\n".join(words), justify="right", min_width=max(map(len, words)))
     categories = summary["categories"]
     rows = [(name, row, _counts(row)) for name, row in categories.items()]
     totals = tuple(sum(column) for column in zip(*(counts for *_, counts in rows), strict=True))
@@ -131,9 +132,7 @@ def summary_table(summary: dict[str, Any]) -> Table:
             escape(name),
             f"{strict_successes}/{objects}",
             f"{successes}/{objects}",
-            number(row["add_s_mm"]["median"]),
-            number(row["add_s_mm"]["p95"]),
-            *(number(row[key]["median"]) for key in ERRORS[1:]),
+            *(number(row[key]["median"]) for key in ERRORS),
         )
     return table
 

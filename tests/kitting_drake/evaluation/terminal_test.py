@@ -57,11 +57,17 @@ def test_the_table_names_the_ambiguity_of_a_success():
     assert all("yellow" in str(word) for word in words[1:4])
 
 
-def test_headings_break_between_words_only():
-    summary = summarise([make_episode(0, [1.0])], CHOSEN, ADD_S, wall_seconds_total=1.0)
+def test_the_summary_table_fits_into_80_columns():
+    objects = [make_object("combination_wrench", 1.0), make_object("x" * 30, 1.0)]
+    episode = make_result(0, objects).as_dict()
+    summary = summarise([episode], CHOSEN, ADD_S, wall_seconds_total=1.0)
     shown = captured(summary_table(summary), width=80)
     assert "position" in shown
+    assert "combination_wrench" in shown
     assert "…" not in shown
+    lines = [line.rstrip() for line in shown.splitlines()[3:]]
+    assert {line[-1] for line in lines} <= set("┓┃┩│┘")
+    assert max(map(len, lines)) <= 80
 
 
 def test_the_lines_below_the_table_of_an_episode():
