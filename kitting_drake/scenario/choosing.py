@@ -126,8 +126,8 @@ def choose_scenario(arguments: argparse.Namespace) -> ChosenScenario:
         first, *others = scenario_names(chosen.path)
         if others:
             print(
-                f"note: {chosen.path} has several scenarios, and this is {first}: "
-                f"for {' or '.join(others)} give --scenario_name"
+                f"note: this is {first}, the first scenario in {chosen.path}; "
+                f"--scenario_name chooses {' or '.join(others)}"
             )
     return chosen
 

@@ -82,7 +82,7 @@ def test_the_other_scenarios_of_a_file_are_named(
     path = write(tmp_path, "A: {}\nx-common: {}\nB: {}\nC: {}\n")
     assert choose_scenario(parse(path)).name == "mine"
     assert capsys.readouterr().out == (
-        f"note: {path} has several scenarios, and this is A: for B or C give --scenario_name\n"
+        f"note: this is A, the first scenario in {path}; --scenario_name chooses B or C\n"
     )
     choose_scenario(parse(path, "--scenario_name", "B"))
     choose_scenario(parse(path, "--quiet"))
