@@ -45,7 +45,8 @@ def place(item: PlacedObject, target: Goal, X_WB: RigidTransform, success=None) 
 
 
 def test_add_s_of_a_small_translation_is_its_length():
-    moved = RigidTransform([0.3, -0.4, 0.5])  # Shorter than half the square's side.
+    moved = RigidTransform([0.3, -0.4, 0.5])
+    # This translation is shorter than half the square's side, so the nearest point is the same one.
     assert add_s(SQUARE, RigidTransform(), moved) == pytest.approx(np.sqrt(0.5))
 
 

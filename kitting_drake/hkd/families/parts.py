@@ -101,8 +101,9 @@ def ring(outer: float, inner: float, height: float) -> PartDesign:
         )
     if small <= _PAD or (big + small) / 2 - _INNER_REACH < -math.sqrt(small**2 - 110.0):
         raise PartError(
-            f"a bore of {inner:g} mm has no room for the finger that grips the rim of a ring of "
-            f"more than {WIDEST_MM:g} mm: give a wider bore, or a smaller ring"
+            f"a ring wider than {WIDEST_MM:g} mm is gripped at its rim, with one finger in the "
+            f"bore, but a bore of {inner:g} mm is too narrow for the finger: give a wider bore, or "
+            "a smaller ring"
         )
     # The two ends of the inner pad touch the bore.
     chord = math.sqrt(small**2 - (_PAD / 2) ** 2)

@@ -36,7 +36,7 @@ def blob(shape: tuple[int, int], centre: tuple[float, float] | NDArray[np.float6
 
 
 def linear(shape: tuple[int, ...], label: tuple[float, ...]) -> Tensor:
-    """The logits that minimise the loss for a label between the entries, which is interpolated."""
+    """The logits with the least loss for a label that lies between entries of the grid."""
     offsets = torch.meshgrid(*map(torch.arange, shape), indexing="ij")
     shares = [(1 - (n - at).abs()).clamp(min=0) for n, at in zip(offsets, label, strict=True)]
     return torch.stack(shares).prod(0).double().log().float()

@@ -20,7 +20,7 @@ def test_phases_sum_to_their_episodes():
         result = rig.run(stopwatch.observe)
         simulated += result.sim_seconds
         wall += result.wall_seconds
-    # The phases add up to the episode, including the last one, during which it ends.
+    # The times of the phases add up to the time of the episode. The last, unfinished phase counts.
     assert list(stopwatch.phases)[:2] == ["observe", "approach"]
     assert sum(phase[0] for phase in stopwatch.phases.values()) == pytest.approx(simulated)
     assert sum(phase[1] for phase in stopwatch.phases.values()) == pytest.approx(wall, rel=0.5)
