@@ -23,6 +23,11 @@ _NOT_MEASURED = (
         "not given",
         "drawn until the open hand has room at every annotated grasp",
     ),
+    (
+        "fingers, on the pyramid",
+        "not given",
+        "15 mm thick; the gap between two cubes is 10 mm, so jaws along a row push the next cube",
+    ),
     ("release, in cells marked `e`", "the jaws open by 5 mm in all", "by 12 mm in all"),
     ("open jaws, place red in green, cells marked `e`", "50 mm apart", "80 mm apart"),
     ("demonstrated picks, in cells marked `e`", "off the middle along one axis", "at the middle"),
