@@ -26,7 +26,7 @@ _NOT_MEASURED = (
     (
         "fingers, on the pyramid",
         "not given",
-        "15 mm thick; the gap between two cubes is 10 mm, so jaws along a row push the next cube",
+        "15 mm thick, in a gap of 10 mm: along a row they push the next cube",
     ),
     ("release, in cells marked `e`", "the jaws open by 5 mm in all", "by 12 mm in all"),
     ("open jaws, place red in green, cells marked `e`", "50 mm apart", "80 mm apart"),
