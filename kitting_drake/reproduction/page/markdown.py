@@ -12,7 +12,7 @@ def rate_text(rate: float, interval: Sequence[float]) -> str:
 def markdown_table(
     headings: Sequence[str], rows: Sequence[Sequence[str]], left_columns: int = 1
 ) -> str:
-    """Formats a table whose source is aligned.
+    """Formats a table whose source is aligned, except for the end of a last column of text.
 
     Args:
         headings: the headings of the columns.
@@ -22,6 +22,8 @@ def markdown_table(
     """
     # Make rules of at least three characters, because some readers require it.
     widths = [max(3, *map(len, column)) for column in zip(headings, *rows, strict=True)]
+    if left_columns == len(headings):
+        widths[-1] = 3
     rule = [
         "-" * width if index < left_columns else "-" * (width - 1) + ":"
         for index, width in enumerate(widths)
