@@ -352,7 +352,8 @@ class PickPlacePlanner(LeafSystem):
 
 
 def _action_of(state: PlannerState) -> PickPlaceAction:
-    """Returns the action that began last, or the stopping action after a stop, without heights."""
+    """Returns the action that began last; after a stop, the stopping action. Its heights are not
+    set."""
     pick, place = (PlanarPose(*map(float, pose)) for pose in (state.pick, state.place))
     return PickPlaceAction(
         pick,

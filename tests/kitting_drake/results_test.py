@@ -127,7 +127,7 @@ def test_success_by_method_and_orientations_strict_first(folder: Path):
         *"---",
     ]
     assert ("oracle, exact", "", "") not in rows
-    assert rows["*paper*, ours", "", "100"] == ["", "", "", "- / 96.5"]
+    assert rows["*paper*, its own method", "", "100"] == ["", "", "", "- / 96.5"]
     assert UNSEEN not in page(folder)
 
 

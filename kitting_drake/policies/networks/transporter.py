@@ -279,7 +279,8 @@ def draw_bins(
 
 
 def among(label: list[tuple[int, float]], drawn: dict[int, float]) -> list[tuple[int, float]]:
-    """Converts an interpolated label from bins to positions in `drawn`."""
+    """Replaces each bin of an interpolated label by its index among the keys of `drawn`, the bins
+    of this training step."""
     index = {bin_: position for position, bin_ in enumerate(drawn)}
     return [(index[bin_], weight) for bin_, weight in label]
 

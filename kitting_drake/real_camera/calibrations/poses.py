@@ -67,8 +67,8 @@ def read_pose(node: dict[str, Any], where: str, folder: Path) -> Array:
         X, body = found.X, found.child if is_body(found.child) else ""
     if body:
         raise UserError(
-            f"{found.where} is the pose of {body}, the camera's body: give optical_to_link beside "
-            f"it, which `tf2_echo {body} ..._optical_frame` prints"
+            f"{found.where} is the pose of {body}, the camera's body: also give optical_to_link "
+            f"there; the command `tf2_echo {body} ..._optical_frame` prints it"
         )
     if not found.in_hand:
         if "hand_to_base" in node:

@@ -102,7 +102,7 @@ def _success_table(runs: list[Run], paper: _Paper) -> str:
         rows += [row(method, *found) for found in sorted(set(mine), key=str)]
         if method == "so2":
             given = [f"- / {paper.ours:g}" if n == 180 else "" for n in orientations]
-            rows.append(["*paper*, ours", "", "100", *given])
+            rows.append(["*paper*, its own method", "", "100", *given])
     others = {key[:3] for key in cells if key[0] not in (*LEARNED, "quantized_oracle", "oracle")}
     rows += [row(*key) for key in sorted(others, key=str)]
     present = {method for method, *_ in cells}

@@ -13,8 +13,9 @@ RATES = "learning_rates.json"
 """The name of the file, which is beside the results."""
 
 Rates = Mapping[str, Mapping[str, float]]
-"""The cost on validation scenes by training (`rates_key`) and learning rate. It is in mm, or the
-loss in nats on a Ravens task. It is infinite (null in the file) if training diverged."""
+"""Maps the key of a training (`rates_key`) and a learning rate to the cost on validation scenes. The
+cost is a displacement in mm; on a Ravens task it is the loss in nats. It is infinite (null in the
+file) if the training diverged."""
 
 
 def read_rates(folder: Path) -> dict[str, dict[str, float]]:

@@ -113,7 +113,7 @@ def _figure_table(task: str, results: Mapping[str, Result], again: Collection[st
             rows.append([METHODS[method], str(count), *given])
         if method == "so2":
             paper = [f"- / {PAPER[_TITLES[task]].ours:g}" if n == 180 else "" for n in COLUMNS]
-            rows.append(["*paper*, ours", "100", *paper])
+            rows.append(["*paper*, its own method", "100", *paper])
     oracle = [text(f"{task}_quantized_oracle_{n}") for n in COLUMNS]
     rows.append([METHODS["quantized_oracle"], "", *oracle])
     return markdown_table(["method", "demonstrations", *(f"N = {n}" for n in COLUMNS)], rows)
@@ -178,7 +178,7 @@ def fresh_tools(results: Sequence[Result], again: Collection[str] = ()) -> list[
         return []
     rows = [
         [
-            label.replace("_", " "),
+            label.replace("_", " ").replace("of 100", "trained on 100"),
             *(both_rates(result) if result else [absent_text(f"fresh_{label}", again), "-", "-"]),
         ]
         for label, result in found.items()
@@ -186,7 +186,9 @@ def fresh_tools(results: Sequence[Result], again: Collection[str] = ()) -> list[
     return [
         "### Ten fresh tools\n",
         prose("fresh_tools"),
-        markdown_table(["policy", "strict success, %", "over tools", "paper's measure, %"], rows),
+        markdown_table(
+            ["policy", "strict success, %", "interval over tools", "paper's measure, %"], rows
+        ),
     ]
 
 

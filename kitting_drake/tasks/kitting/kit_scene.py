@@ -121,7 +121,8 @@ def _goal(
 
 
 def _seat(tool: Tool, kit: Kit, slot: int) -> RigidTransform:
-    """The pose of a seated tool in the frame of the tool for which its cavity was made."""
+    """The pose of a tool in the cavity of a slot, in the frame of the tool for which the cavity was
+    made. These may be two tools."""
     model = kit.tools[slot]
     cavity = cavity_outline(model.footprint, kit.parameters.of_tool(model.name))
     seat = find_seat(tool.footprint, model.footprint, cavity)
