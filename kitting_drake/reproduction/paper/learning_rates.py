@@ -13,9 +13,9 @@ RATES = "learning_rates.json"
 """The name of the file, which is beside the results."""
 
 Rates = Mapping[str, Mapping[str, float]]
-"""Maps the key of a training (`rates_key`) and a learning rate to the cost on validation scenes. The
-cost is a displacement in mm; on a Ravens task it is the loss in nats. It is infinite (null in the
-file) if the training diverged."""
+"""Maps the key of a training (`rates_key`) and a learning rate to the cost on validation scenes.
+The cost is a displacement in mm; on a Ravens task it is the loss in nats. It is infinite (null in
+the file) if the training diverged."""
 
 
 def read_rates(folder: Path) -> dict[str, dict[str, float]]:
