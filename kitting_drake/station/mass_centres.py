@@ -35,7 +35,7 @@ def drift(
 
 
 def _cross(a: Sequence[float], b: Sequence[float]) -> tuple[float, float, float]:
-    """The cross product of two vectors; `np.cross` takes ten times as long for one pair."""
+    """The cross product of two vectors; `np.cross` takes over ten times as long for one pair."""
     return (
         a[1] * b[2] - a[2] * b[1],
         a[2] * b[0] - a[0] * b[2],
