@@ -22,19 +22,19 @@ from kitting_drake.hkd.kits.parameters import KitParameters
 TEST_HOLE_MM = 20.0
 """The side of the square hole in `test_piece`, in mm."""
 _ABOVE = 0.01
-"""How far the solids that are subtracted stick out of the block, in metres.
+"""How far the solids that cut notches and labels stick out above the block, in metres.
 
 Without this, rounding could leave a thin skin at the block's top.
 """
 _FINEST = 2e-6
 """The size of the smallest detail that the solid keeps, in metres."""
 _DIGITS = 4
-"""The number of decimals of coordinates in files, where the unit is 1 mm."""
+"""The number of decimals to which coordinates are rounded in files, whose unit is 1 mm."""
 
 
 @dataclass(frozen=True)
 class Design:
-    """A kit block with everything that is cut from it."""
+    """A kit's block, with all recesses that are cut from it."""
 
     kit: Kit
     cavities: tuple[Cavity, ...]
@@ -181,12 +181,12 @@ def in_block(points: NDArray[np.float64], parameters: KitParameters) -> NDArray[
 
 
 def loops_mm(outline: CrossSection, parameters: KitParameters) -> list[NDArray[np.float64]]:
-    """Converts an outline in the kit frame to closed loops (n, 2), as `in_block` does."""
+    """Converts an outline in the kit frame to closed loops (n, 2) in mm, in the files' frame."""
     return [in_block(np.asarray(loop), parameters) for loop in outline.to_polygons()]
 
 
 def layers(design: Design) -> dict[tuple[str, float], list[Recess]]:
-    """Groups the recesses by (kind, depth in mm), in drawing order."""
+    """Groups the recesses by (kind, depth in mm): cavities first, then notches, then labels."""
     groups: dict[tuple[str, float], list[Recess]] = {}
     for recess in design.recesses:
         groups.setdefault((recess.kind, design.depth_mm(recess)), []).append(recess)

@@ -82,7 +82,7 @@ class KitFiles:
     """The pieces of the block. None: the block is not split."""
     sheet: FoamSheet | None
     notes: tuple[str, ...]
-    """A sentence for each thing that found no room or cannot be printed."""
+    """Sentences for the user, for instance on labels without room and on thin walls."""
 
 
 def export_kit(request: KitRequest) -> KitFiles:
@@ -120,7 +120,7 @@ def export_kit(request: KitRequest) -> KitFiles:
 
 
 def _made(request: KitRequest, kit: Kit, others: Sequence[SheetKit]) -> KitFiles:
-    """Designs a kit, splits its block and fills its sheet, as requested."""
+    """Designs a kit's block; on request, splits the block and arranges kits on a sheet."""
     design = design_kit(
         kit,
         notches=request.notches,
@@ -288,7 +288,7 @@ def _record(design: Design, names: Sequence[str]) -> dict[str, Any]:
 
 
 def _parts_record(made: KitFiles) -> dict[str, Any]:
-    """Returns the entries of `kit.json` on the pieces and the sheet, in mm."""
+    """Returns the entries of `kit.json` that describe the block's pieces and the sheet, in mm."""
     record: dict[str, Any] = {}
     if made.split is not None:
         record["pieces"] = [

@@ -1,4 +1,4 @@
-"""Fills a foam sheet or a drawer with kits, and draws it in millimetres."""
+"""Arranges kits on a foam sheet or in a drawer, and draws the sheet in millimetres."""
 
 import io
 import itertools
@@ -22,7 +22,7 @@ MOST_KITS = 60
 """The largest number of kits on a sheet."""
 
 _MIXTURES = 40
-"""The number of packings to try in which randomly chosen copies are turned."""
+"""The number of packings to try in which random copies of the kit are turned by 90 degrees."""
 _SHEET, _BLOCK = "SHEET", "BLOCK"
 _STROKES = ("#0b5fa5", "#2b8a3e", "#9c36b5", "#d9480f", "#087f5b", "#a61e4d", "#5f3dc4")
 _COLOURS = (4, 3, 6, 30, 2, 1, 150, 80)
@@ -30,7 +30,7 @@ _COLOURS = (4, 3, 6, 30, 2, 1, 150, 80)
 
 @dataclass(frozen=True)
 class SheetKit:
-    """The drawing of a kit."""
+    """The outlines of a kit's block and recesses, which are drawn on a sheet."""
 
     name: str
     size: tuple[float, float]
@@ -38,12 +38,12 @@ class SheetKit:
     height: float
     """The height of the kit's block, in mm."""
     layers: dict[str, list[NDArray[np.float64]]]
-    """The closed loops (n, 2) in mm of each layer; the origin is the block's lower left corner."""
+    """The closed loops (n, 2) in mm, by layer. The origin is the block's lower left corner."""
 
 
 @dataclass(frozen=True)
 class KitPlace:
-    """A kit on a sheet."""
+    """The place of a kit on a sheet."""
 
     kit: int
     """The index of the kit in `FoamSheet.kits`."""
@@ -99,7 +99,7 @@ def kit_of_folder(folder: Path) -> SheetKit:
     """Reads a kit from the folder that `hkd kit` wrote.
 
     Raises:
-        UserError: the folder has no kit.
+        UserError: the folder's `kit.json` or `cavities.dxf` is missing or damaged.
     """
     try:
         record = json.loads((folder / "kit.json").read_text())
@@ -130,7 +130,7 @@ def fill_sheet(
         copies: the number of copies of each kit; None: copies are added until no more fit.
 
     Raises:
-        UserError: a kit is larger than the sheet.
+        UserError: a kit is larger than the sheet without its margins.
     """
     room = (size[0] - 2 * margin, size[1] - 2 * margin)
     for kit in kits:
@@ -185,7 +185,7 @@ def _packings(
         count = min(len(order), int(room[0] * room[1] / areas[0]) + 1)
         order = order[:count]
         # Try each number of turned copies, placed before or after the other copies. Then turn
-        # copies at random, because the densest packing may be a pinwheel.
+        # copies at random, because the densest packing may mix both directions like a pinwheel.
         for first, number in itertools.product((False, True), range(count + 1)):
             patterns.append([first] * number + [not first] * (count - number))
         mixtures = np.random.default_rng(0).random((_MIXTURES, count)) < 0.5
@@ -209,7 +209,7 @@ def _packed(
         gap: the least distance between two blocks, in mm.
         kits: the kits.
         order: the indices of the kits to place.
-        turned: whether each kit in `order` is turned; None: as it fits best.
+        turned: whether to turn each kit in `order`; None: each is turned if this packs it better.
         by_rows: whether each kit goes as low as possible; if not, it goes as far left as possible.
     """
     places: list[KitPlace] = []
@@ -278,7 +278,7 @@ def _free_corner(
 def sheet_layers(sheet: FoamSheet) -> dict[str, list[NDArray[np.float64]]]:
     """Returns the closed loops (n, 2) in mm of each layer of a sheet.
 
-    The first layers are SHEET and BLOCK. There is one more for each kind and depth of recess.
+    The first layers are SHEET and BLOCK. Then there is a layer for each kind and depth of recess.
     """
     length, width = sheet.size
     layers = {_SHEET: [np.array([(0, 0), (length, 0), (length, width), (0, width)], dtype=float)]}
@@ -291,7 +291,7 @@ def sheet_layers(sheet: FoamSheet) -> dict[str, list[NDArray[np.float64]]]:
 
 
 def moved(points: NDArray[np.float64], place: KitPlace, sheet: FoamSheet) -> NDArray[np.float64]:
-    """Moves points (n, 2) from a kit's frame to its place on the sheet, in mm."""
+    """Converts points (n, 2) in mm from the frame of a placed kit to the sheet's frame."""
     if place.turned:
         width = sheet.kits[place.kit].size[1]
         points = np.column_stack([width - points[:, 1], points[:, 0]])

@@ -1,4 +1,4 @@
-"""The command line of `hkd kit`, and the kit's parameters that follow from it."""
+"""The command line of `hkd kit`, and its conversion to a kit's parameters."""
 
 import argparse
 import dataclasses
@@ -18,7 +18,7 @@ FITS = {"snug": 0.15, "easy": 0.35, "loose": 0.75}
 """The named clearances between a tool and its cavity's wall, on each side, in mm."""
 
 _WIDEST_MM = 10.0
-"""The largest clearance, in mm."""
+"""The largest clearance that can be given, in mm."""
 _LONGEST_MM = 1000.0
 """The largest length or width that can be given for a block, in mm."""
 
@@ -58,7 +58,7 @@ class KitRequest:
     stand_out_mm: float = 0.0
     """The height of the tools' tops above the block's top."""
     wall_mm: float | None = None
-    """The thickness of the wall between and around the cavities. None: the default, 6 mm."""
+    """The least thickness of the walls between and around the cavities. None: the default, 6 mm."""
     block_mm: tuple[float, float, float] | None = None
     """The block's length, width and height.
 
@@ -114,8 +114,8 @@ def check_request(request: KitRequest) -> None:
     most = (request.wall_mm or 1e3 * KitParameters().nested_wall) / 2
     if request.chamfer_mm > most:
         raise UserError(
-            f"--chamfer_mm {request.chamfer_mm:g} is more than half of the wall: give at most "
-            f"{most:g}"
+            f"--chamfer_mm {request.chamfer_mm:g} is more than half of the wall's thickness: give "
+            f"at most {most:g}"
         )
 
 
@@ -167,7 +167,7 @@ def _lengths(request: KitRequest) -> KitParameters:
 def _clearance_of(request: KitRequest, loaded: Mapping[str, Tool]) -> dict[str, float]:
     """Returns the clearances of single tools, in metres, by the tools' names.
 
-    They are those of `fit_of`, and the wider ones of tools whose outline is uncertain.
+    These tools are those in `fit_of`, and those whose outline is uncertain.
 
     Raises:
         UserError: the kit has no such tool, or a clearance is out of range.

@@ -25,7 +25,7 @@ _CELL = 0.0007
 _FARTHEST = 0.03
 """The largest distance of a label from its cavity, in metres."""
 _PLAINLY = 1.5
-"""A label must be farther from other cavities than from its own, by at least this factor."""
+"""A label is at least this many times as far from other tools' cavities as from its own tool's."""
 # The cost of a label beside its cavity, in metres, is the sum of: the label's distance from the
 # cavity; a tenth of its distance from the cavity's middle; 6 mm if the text is rotated; and minus
 # 6 times the height of its letters.
@@ -55,7 +55,7 @@ class _Raster:
     """A raster over the block on which masks are computed: rows along y, columns along x."""
 
     start: NDArray[np.float64]
-    """The (x, y) of the raster's lower left corner, in metres."""
+    """The (x, y) of the raster's lower left corner in the kit frame, in metres."""
     counts: tuple[int, int]
     """The numbers of rows and columns."""
 
@@ -74,7 +74,7 @@ def engrave_labels(
     Args:
         kit: the kit; its tools' names are engraved.
         cavities: the cavities of the tools, in the tools' order.
-        taken: the recesses cut so far; labels keep their distance from them.
+        taken: the recesses cut so far; labels stay `_MARGIN` away from them.
 
     Returns:
         The labels, and a sentence for each tool whose label does not fit.

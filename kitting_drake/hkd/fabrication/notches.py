@@ -18,7 +18,10 @@ DEEPEST = 0.020
 """The largest depth of a notch in metres: the reach of a finger."""
 
 _WALL = 0.003
-"""The least wall around a notch in metres, unless the kit's own walls are thinner."""
+"""The least thickness of the walls around a notch, in metres.
+
+If the kit's own walls are thinner, their thickness is the limit instead.
+"""
 _SLIDES = tuple(sign * step for step in np.arange(0.0, 0.041, 0.004) for sign in (1, -1))
 """The distances from the grasp, along the tool, at which a notch is tried, in metres."""
 _SHARES = (0.85, 1.15)
@@ -39,7 +42,7 @@ def cut_notches(
     Args:
         kit: the kit.
         cavities: the cavities of the tools, in the tools' order.
-        taken: the recesses cut so far; notches keep their distance from them.
+        taken: the recesses cut so far; a wall is left between them and the notches.
 
     Returns:
         The notches, and a sentence for each tool beside which no notch fits.
@@ -117,7 +120,7 @@ def _beside(
     held = np.array([pose.x + c * grasp.x - s * grasp.y, pose.y + s * grasp.x + c * grasp.y])
     start = held + slide * along
     crossings = _crossings(cavity.outline, start, across)
-    # A line that misses or only touches the cavity has no wall on one side.
+    # Skip a line that misses or only touches the cavity: it does not meet a wall on both sides.
     if len(crossings) and crossings.min() < 0 < crossings.max():
         yield start + crossings.max() * across, across
         yield start + crossings.min() * across, -across

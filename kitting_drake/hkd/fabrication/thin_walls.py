@@ -84,7 +84,7 @@ def _vanished(
     """Finds missing walls, where a cavity overlaps another cavity or the block's side.
 
     Yields:
-        A text that names the two things that the wall should divide, and a sentence for the user.
+        A text that names the two things that the wall should separate, and a sentence for the user.
     """
     cavities = [recess for recess in recesses if recess.kind == "cavity"]
     for one, other in itertools.combinations(cavities, 2):
@@ -134,7 +134,7 @@ def _place(part: CrossSection, design: Design) -> str:
 
 
 def _distance(point: NDArray[np.float64], recess: Recess, design: Design) -> float:
-    """Returns the horizontal distance of a point (3) from the bounds of a recess, in mm."""
+    """Returns the horizontal distance of a point (3) from a recess's bounding box, in mm."""
     x_min, y_min, x_max, y_max = recess.outline.bounds()
     corners = in_block(np.array([(x_min, y_min), (x_max, y_max)]), design.kit.parameters)
     outside = np.maximum(corners[0] - point[:2], point[:2] - corners[1])

@@ -187,7 +187,7 @@ class _Cutter:
         """Divides the block into the given numbers of pieces along x and y.
 
         Returns:
-            The cuts, or None if all cuts that were tried leave a thin wall.
+            The cuts, or None if all cuts that were tried leave a thin wall or a piece in two parts.
         """
         price = self._price.copy()
         for _ in range(_REPAIRS):

@@ -1,7 +1,8 @@
 """Dovetails that join the pieces of a block.
 
-A dovetail is a prism that stands on the bed, so it prints without support, and a piece slides onto
-its neighbours from above. Where a cavity is in the way, the dovetail ends below the cavity's floor.
+A dovetail is a prism that stands on the printer's bed, so it prints without support. A piece slides
+onto its neighbours from above. Where a cavity is in the way, the dovetail ends below the cavity's
+floor.
 """
 
 import itertools
@@ -26,7 +27,7 @@ APART = 60.0
 """The approximate distance between dovetails of the same two pieces, in mm."""
 
 _ROOF = 2.0
-"""The least material above a dovetail that ends below a floor, in mm."""
+"""The least material between a dovetail and the floor of a recess above it, in mm."""
 _LOWEST = 5.0
 """The least height of a dovetail, in mm."""
 _MARGIN = LEAST_WALL + 0.6
