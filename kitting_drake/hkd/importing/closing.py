@@ -18,7 +18,7 @@ def capped(vertices: Array, faces: Faces) -> Faces | None:
     Openings in the same plane are closed together, so a rim inside another rim stays a hole.
 
     Args:
-        vertices: the vertices (n, 3) in mm, for a surface about 180 mm long.
+        vertices: the vertices (n, 3) in mm; the surface is scaled to a length of about 180 mm.
         faces: the triangles (m, 3), consistently wound.
 
     Returns:

@@ -45,8 +45,11 @@ class Decomposition:
     hulls: list[np.ndarray]
     """The vertices (n, 3) of each hull, in mm."""
     outline_deviation_mm: float
-    """The largest distance between the outlines of the hulls and of the solid from above, in mm, at
-    most 5. Notches narrower than 4 mm are ignored. Infinity if there are no hulls."""
+    """The largest distance between the outlines of the hulls and of the solid from above, in mm.
+
+    Notches narrower than 4 mm are ignored, and distances above 5 mm count as 5. Infinity if there
+    are no hulls.
+    """
 
 
 def decompose(solid: Manifold, grasp: Grasp) -> Decomposition:

@@ -40,8 +40,8 @@ def true_length(
 ) -> tuple[float, str]:
     """Returns the length of a tool in mm, and a phrase for the user that explains it.
 
-    Many meshes do not state a unit. The unit is then taken to be the only one in which the length
-    and height of the tool are permitted.
+    Many meshes do not state a unit. It is then inferred: it must be the only unit in which the
+    tool's length and height are permitted.
 
     Args:
         length: the length of the tool at rest, in the unit of its file.

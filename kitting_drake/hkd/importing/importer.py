@@ -48,8 +48,8 @@ def import_tool(request: ImportRequest, time_limit: float | None = TIME_LIMIT) -
 
     Args:
         request: the file to import, and the properties of the tool.
-        time_limit: the processor time of the child process in seconds; None imports in this
-            process.
+        time_limit: the limit of the child process's processor time, in seconds. None: there is no
+            child process; this process makes the tool.
 
     Raises:
         UserError: the tool cannot be made; nothing is written then.

@@ -36,7 +36,7 @@ DENSITY_RANGE = (50.0, 25_000.0)
 
 _SLICES = 60
 _END = 0.3
-"""The length of an end, as a share of the tool's length."""
+"""The length of each of a tool's two ends, as a share of the tool's length."""
 _STEP_WIDTH = 1.5
 """A hammer or screwdriver is split into two bodies if its head or handle is at least this many
 times as wide as its shaft."""

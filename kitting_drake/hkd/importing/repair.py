@@ -291,7 +291,7 @@ def _wrapped(triangles: Array) -> Manifold:
     row, plane = int(shape[2]), int(shape[1] * shape[2])
 
     def depth(x: float, y: float, z: float) -> float:
-        """Returns the field at a point, interpolated linearly."""
+        """Returns the depth of a point in the solid, in voxels, interpolated linearly."""
         i, j, k = (x - low_x) / _VOXEL_MM, (y - low_y) / _VOXEL_MM, (z - low_z) / _VOXEL_MM
         a, b, c = (
             min(max(int(i), 0), last_x),

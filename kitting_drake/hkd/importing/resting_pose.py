@@ -29,7 +29,7 @@ from kitting_drake.common.sdformat import model_text
 _DROP = 0.002
 """The height from which the tool is dropped, in metres."""
 _SETTLE = 2.0
-"""The simulated time, in seconds."""
+"""The simulated time after which the tool counts as at rest, in seconds."""
 _STEP, _SMALL_STEP = 1 / 128, 1 / 1024
 _SMALL_MM = 60.0
 """The length in mm below which a shorter time step is needed, because the tool is so light that the

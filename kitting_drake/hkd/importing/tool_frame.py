@@ -22,7 +22,7 @@ _EQUAL_HEIGHT_MM, _MARGIN_STEP_MM = 0.3, 0.5
 # of least inertia, and `_LIKE_DEG` the standard deviation of the Gaussian.
 _SIDEWAYS_DEG, _LIKE_DEG = 25.0, 6.0
 _END = 0.3
-"""The length of an end, as a share of the tool's length."""
+"""The length of each of a tool's two ends, as a share of the tool's length."""
 
 
 def to_tool_frame(solid: Manifold, category: str) -> Manifold:

@@ -35,7 +35,7 @@ _LEAST_AREA_MM2 = 1.0
 _LINE_MM = 1.5
 """The width in mm below which two outlines count as the two sides of one thick line."""
 _BOX = 0.9
-"""The least share of its bounding box that a rectangle fills, even if its corners are round."""
+"""A curve counts as a rectangle if it fills at least this share of its bounding box."""
 _THE_PAGE = "the page"
 _PAGE = 0.85
 """A rectangle counts as the page if each of its sides is `_PAGE` to 1 / `_PAGE` times as long as
@@ -44,7 +44,7 @@ _HOLE, _TOOL = 0.25, 0.4
 """Shares of a rectangle's length. A curve in the rectangle that is shorter than `_HOLE` is a hole,
 and a curve that is longer than `_TOOL` may be a tool."""
 _ROUND = 0.02
-"""The largest relative difference of a round curve from a circle."""
+"""The largest relative difference of a round curve's extents and area from those of a circle."""
 
 Points = NDArray[np.float64]
 
@@ -59,7 +59,7 @@ class _Loop:
 
     area: CrossSection
     element: int | None
-    """The number of the curve's filled element, as in `Curve`."""
+    """See `Curve.element`."""
 
     @property
     def size(self) -> Points:
@@ -257,7 +257,7 @@ def _gap_error(chains: list[Points], drawn: DrawnCurves, path: Path) -> UserErro
     gaps[gaps <= _JOIN_MM] = np.inf
     one, other = np.unravel_index(int(np.argmin(gaps)), gaps.shape)
     x, y = (ends[one] + ends[other]) / 2
-    # In SVG y points down, from the page's upper edge.
+    # Give y as an SVG does: down from the page's upper edge.
     place = f"x = {x:.1f}, y = {y if drawn.page_mm is None else -y:.1f} mm"
     return UserError(
         f"{path} has an open curve with a gap of {gaps[one, other]:.2f} mm at {place}: close the "

@@ -28,7 +28,8 @@ def svg_curves(path: Path, unit_mm: float | None = None) -> DrawnCurves:
 
     The scale follows from width, height and viewBox. If they have no units, a pixel is
 
-    - 1/72 inch in files of Adobe Illustrator, and 1/90 inch in those of Inkscape before 0.92;
+    - 1/72 inch in files of Adobe Illustrator;
+    - 1/90 inch in files of Inkscape before 0.92, and 1/96 inch in later ones;
     - else the unit that makes the page a standard sheet of paper, if there is one;
     - else 1/96 inch.
 
@@ -95,11 +96,10 @@ def _read_style(root: ElementTree.Element) -> None:
 
 
 def _scale(root: ElementTree.Element, text: bytes, unit_mm: float | None) -> tuple[float, str]:
-    """Returns the length in mm of a pixel of svgelements, and a phrase that says how it is known.
+    """Returns the length in mm of a pixel, and a phrase that says how it is known.
 
     Raises:
-        UserError: the scale cannot be inferred, or the page's size contradicts the pixels of the
-            program that wrote the file.
+        UserError: the scale is unknown or ambiguous.
     """
     if unit_mm is not None:
         # Remove the width and height, so that a pixel is one unit of the drawing.
