@@ -57,7 +57,8 @@ def _rounded(outline: CrossSection, radius: float) -> CrossSection:
 def _star(points: int, outer: float, inner: float) -> CrossSection:
     """Draws a star with a point toward +y.
 
-    `outer` is the distance of the points from the centre, and `inner` that of the corners between.
+    `outer` is the distance of the points from the centre, and `inner` that of the corners between
+    them.
     """
     angles = math.pi / 2 + np.arange(2 * points) * math.pi / points
     radii = np.where(np.arange(2 * points) % 2, inner, outer)

@@ -210,9 +210,9 @@ def _write(
 def _rank(proposal: GraspProposal) -> float:
     """Returns the cost of a grasp of a shape.
 
-    Shapes are far apart in their kit, so the cost of a close neighbour is left out. The centre of
-    mass counts more than for a hand tool: a shape has no handle, and a grasp near its end touches
-    only a small part of the pads.
+    Shapes are far apart in their kit, so the cost of being close to a neighbour is left out. The
+    distance from the centre of mass costs more than for a hand tool: a shape has no handle, and
+    near its end it touches only a small part of the pads.
     """
     beside = proposal.offset / _BESIDE
     return proposal.cost - proposal.penalties["neighbour in the kit"] + beside

@@ -19,8 +19,8 @@ from kitting_drake.hkd.tools.solids import SEGMENTS
 GRID_MM = 0.05
 
 _XY, _XZ, _YZ = [0, 1], [0, 2], [1, 2]
-# A first pass merges hulls whose projections change by less than this, to leave fewer hulls for the
-# search.
+# A first pass merges hulls whose projections change by less than this. Fewer hulls are then left
+# to grow, which is slow.
 _EXACT_MM = 0.03
 # A region counts as inside another one if at most this area (mm^2) of it lies outside.
 _AREA = 1e-4
@@ -48,12 +48,12 @@ def closed(profile: CrossSection, clearance: float) -> CrossSection:
 def furthest(
     inner: CrossSection, outer: CrossSection, precision: float = 0.01, area: float = _AREA
 ) -> float:
-    """Returns the largest distance of a point of `inner` from `outer`, at most 5 mm.
+    """Returns the largest distance in mm of a point of `inner` from `outer`, or 5 if it is larger.
 
     Args:
         inner, outer: two regions, in mm.
         precision: the precision of the distance, in mm.
-        area: the area in mm^2 below which parts of `inner` are ignored.
+        area: the area of `inner`, in mm^2, that may lie farther away.
     """
     low, high = 0.0, 5.0
     while high - low > precision:
@@ -152,8 +152,8 @@ def _fits(hull: _Hull, allowed: CrossSection, tolerance: float) -> bool:
 
 
 def _merged(hulls: list[_Hull], allowed: CrossSection, tolerance: float) -> list[_Hull]:
-    """Merges pairs of hulls, in order of the least added volume, until no merged pair is
-    allowed."""
+    """Merges pairs of hulls, as long as `_fits` allows one; first the pair that adds the least
+    volume."""
     alive = dict(enumerate(hulls))
 
     def options(a: int, b: int) -> list[tuple[float, int, int]]:
@@ -178,10 +178,11 @@ def cover(
 ) -> list[np.ndarray]:
     """Covers `hulls` with few convex hulls, which may overlap. The result is deterministic.
 
-    Each hull is a seed. It is repeatedly merged with the neighbour that adds the least volume. Its
-    xy projection must stay within `allowed`; its other projections may grow by at most `tolerance`
-    (mm). Then grown hulls are selected, each the one that covers the most uncovered volume, until
-    all of `hulls` are covered. Finally, hulls that hardly change any projection are dropped.
+    First, hulls are merged where this hardly leaves `outline`. Then each hull is a seed, which is
+    repeatedly merged with the neighbour that adds the least volume. Its xy projection must stay
+    within `allowed`; its other projections may grow by at most `tolerance` (mm). Grown hulls are
+    selected, each the one that covers the most uncovered volume, until all of `hulls` are covered.
+    Finally, hulls that hardly change any projection are dropped.
     """
     merged = _merged([_Hull(h) for h in hulls], _grown(outline, _EXACT_MM), _EXACT_MM)
     grown = [_grow(seed, merged, allowed, tolerance) for seed in range(len(merged))]

@@ -183,7 +183,7 @@ def _with_tips(
 ) -> list[CrossSection]:
     """Extends cells to corners of the outline that are farther than a tolerance from all cells.
 
-    Such corners exist at sharp tips, where the inner outline lies far inside the true one.
+    Such corners exist at sharp tips, where an outline that is moved inward loses much length.
     """
     cells = list(cells)
     near = CrossSection.batch_boolean(cells, OpType.Add).offset(

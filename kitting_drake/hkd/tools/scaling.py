@@ -75,8 +75,7 @@ def weighted_tool(tool: Tool, mass: float) -> Tool:
     """Gives a tool another mass in kg; returns it unchanged if it has that mass.
 
     The distribution of the mass stays the same. The contact stiffness changes with the mass, so
-    that the tool rests as before. Grasps in which the heavier tool would turn between the pads come
-    last.
+    that the tool rests as before. Grasps in which the tool would turn between the pads come last.
 
     Raises:
         UserError: the mass is not positive, the model is not valid, or the cache cannot be written.
@@ -106,7 +105,7 @@ def weighted_tool(tool: Tool, mass: float) -> Tool:
 
 
 def _excess_moment(grasp: Grasp, root: ElementTree.Element, mass: float) -> float:
-    """Returns by how much the weight's moment about the pads exceeds `_EASY_MOMENT` (N m), or 0."""
+    """Returns by how much the weight's moment exceeds `_EASY_MOMENT`, in N m; 0 if it does not."""
     pose = root.findtext(".//inertial/pose") or "0 0"
     x, y, *_ = map(float, pose.split())
     lever = (x - grasp.x) * math.cos(grasp.theta) + (y - grasp.y) * math.sin(grasp.theta)

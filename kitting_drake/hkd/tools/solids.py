@@ -251,7 +251,7 @@ def _plate_hulls(
     bevel: float,
     cells: Sequence[CrossSection],
 ) -> list[np.ndarray]:
-    """Makes prisms over the cells or triangles of a profile, whose lower outer edge is bevelled."""
+    """Makes prisms over the cells or triangles of a plate's profile; the lower edge is bevelled."""
     coarse = profile.simplify(0.08)
     loops = coarse.to_polygons()
     points = np.vstack(loops)

@@ -96,8 +96,8 @@ def measure_rotation(
 ) -> Difference:
     """Compares a tool with its copy, rotated about z by 2 pi / order.
 
-    The copy is first translated so that the area that only one of the outlines covers is least.
-    From there, two separate searches minimize the deviation of the outlines and the distance of the
+    A first search translates the copy to minimize the area that only one outline covers. From
+    there, two separate searches minimize the deviation of the outlines and the distance of the
     surfaces.
 
     Args:
@@ -118,7 +118,7 @@ def measure_rotation(
 
     shift, _ = _minimum(uncommon_area, np.zeros(2), 2.0)
     outline_deviation = deviation(shift)
-    # If the deviation is twice the limit, no other translation can bring it below the limit.
+    # At twice the limit, another translation is assumed not to bring the deviation below the limit.
     if complete or outline_deviation < 2 * MOST_OUTLINE_DEVIATION_MM:
         outline_deviation = _minimum(deviation, shift, 0.5)[1]
     if not complete and outline_deviation >= MOST_OUTLINE_DEVIATION_MM:

@@ -33,8 +33,9 @@ RecordLoader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 class Tool:
     """One hand tool.
 
-    The tool frame T has z up in the tool's stable pose, with the table at z = 0. Its x is along the
-    tool's length with the working end at +x. Its origin is centred in the footprint's bounding box.
+    The tool frame T has z up in the tool's stable pose, with the table at z = 0. The x axis is
+    along the tool's length, toward the working end. The origin is centred in the footprint's
+    bounding box.
     """
 
     directory: Path

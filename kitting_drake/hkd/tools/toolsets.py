@@ -8,7 +8,7 @@ from kitting_drake.hkd.tools.tool import CATEGORIES, load_tool, tool_names
 PAPER_SPLITS = ("train", "test")
 """The splits of the paper's dataset (section IV-B.1): forty tools to train, twenty to test."""
 SPLITS = (*PAPER_SPLITS, "fresh")
-"""All splits. Append new splits at the end, because the seeds depend on the order.
+"""All splits. Append new ones at the end: a split's place in this tuple is part of its seed.
 
 The ten `fresh` tools are not in the paper's data set. They are reserved for a final test, and
 nothing is trained or tuned with them.
