@@ -17,8 +17,11 @@ if TYPE_CHECKING:
     from kitting_drake.hkd.tracing.tracer import TracedTool
 
 _OUTLINE_ERROR_MM = 0.8
-"""`Tool.outline_error` of a traced tool, in mm. If no doubts are reported, the real tool extends
-less than this beyond its outline almost everywhere. Small clearances are increased by this."""
+"""`Tool.outline_error` of a traced tool, in mm.
+
+If the trace reports no doubtful place, the real tool extends less than this beyond its outline
+almost everywhere. `hkd kit` adds this to small clearances.
+"""
 
 
 def describe_trace(tracer: argparse.ArgumentParser) -> None:

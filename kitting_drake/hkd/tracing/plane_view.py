@@ -91,8 +91,9 @@ def focal_of_homography(homography: Array, center: Array) -> float | None:
     h = _centred(homography, center)
     h = h / np.linalg.norm(h)
     a, b = h[:, 0], h[:, 1]
-    # Let w = 1 / f^2. Perpendicular axes require w (a1 b1 + a2 b2) = -a3 b3. Equal scales require
-    # w (a1^2 + a2^2 - b1^2 - b2^2) = b3^2 - a3^2.
+    # The columns a and b stand for the plane's axes; let w = 1 / f^2. Perpendicular axes require
+    # w (a1 b1 + a2 b2) = -a3 b3. Equal scales require w (a1^2 + a2^2 - b1^2 - b2^2) = b3^2 - a3^2.
+    # Solve both for w by least squares.
     left = np.array([a[:2] @ b[:2], (a[:2] @ a[:2] - b[:2] @ b[:2]) / 2])
     right = np.array([-a[2] * b[2], (b[2] ** 2 - a[2] ** 2) / 2])
     w = float(left @ right) / max(float(left @ left), 1e-30)
@@ -113,7 +114,7 @@ def focal_of_height(homography: Array, height: float, start_px: float, center: A
         center: (2,) the principal point in pixels.
     """
     focal = start_px
-    # In a perpendicular view, the camera's height is proportional to the focal length.
+    # Iterate: the camera's height is proportional to the focal length only in a perpendicular view.
     for _ in range(20):
         focal *= height / view_of(homography, focal, center).camera[2]
     return focal

@@ -239,7 +239,7 @@ def _edge(
 
 
 def _robust_line(shares: Array, offsets: Array) -> tuple[Array, Array]:
-    """Fits a line to most of the points (share, offset), and ignores outliers.
+    """Fits a line to points (share of a segment, offset from it), and ignores outliers.
 
     Returns:
         The line's offset at share 0 and its slope; and a mask (n) of the points close to it.

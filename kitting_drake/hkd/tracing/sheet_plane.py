@@ -49,7 +49,7 @@ class GroundPlane:
     sheet: Array | None
     """The sides (2,) of the sheet in mm, if there is one; its lower left corner is the origin."""
     hidden: tuple[Array, ...]
-    """Polygons (n, 2) in mm in which no tools are sought."""
+    """Polygons (n, 2) in mm, around a disc or a board, in which no tools are sought."""
     notes: list[str]
     blur_mm: float = 0.0
     """The width of the blur of the sheet's edges in mm; 0 if unknown."""

@@ -91,7 +91,7 @@ def find_silhouettes(
 
 
 def _unclear(cv2: Any, photo: RectifiedPhoto, differ: Array) -> list[Unclear]:
-    """Returns the regions of a mask (rows, columns) that are not narrow."""
+    """Returns the regions of a mask (rows, columns) that are wider than twice `_EDGE_SLACK_MM`."""
     ppm = photo.px_per_mm
     radius = max(1, round(_EDGE_SLACK_MM * ppm))
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))

@@ -21,8 +21,9 @@ def outline_of_silhouette(
     distance of a point at height h from the point below the camera is H / (H - h) times too large.
     Where an upright side faces away from the camera, the silhouette ends at the side's top edge;
     where it faces the camera, at the side's bottom edge. So the outline is the part of the plane
-    that the silhouette covers at every scale from 1 to (H - t) / H. The widest points of a round
-    tool are at height t / 2 on all sides, so its silhouette is scaled only once.
+    that the silhouette covers at every scale from 1 to (H - t) / H; the point below the camera
+    stays fixed. The widest points of a round tool are at height t / 2 on all sides, so its
+    silhouette is scaled only once.
 
     Args:
         silhouette: the part of the plane that the tool hides.

@@ -17,7 +17,7 @@ _NO_SHADOW = 1.3
 _BALL_MM = 0.9
 """The radius of the disc that `_reached` rolls over the ground, in mm."""
 _ROUGH = 0.022
-"""The least roughness of a tool's surface, in logarithms of light."""
+"""A surface less rough than this counts as even for `MIDDLE`, in logarithms of light."""
 _MOST_FINE = 0.1
 _HOLE_BALL_MM = 0.6
 _STRIP_MM = 1.2
@@ -47,7 +47,7 @@ least darkness of a shadow, in logarithms of light."""
 _NEUTRAL = 0.05
 """The largest difference in colour between shaded and lit ground, in logarithms of light."""
 _LARGEST_HOLE_MM2 = 500.0
-"""The area in mm^2 above which a hole must show ground that is not in shadow."""
+"""The largest area of a hole that lies wholly in shadow, in mm^2. Strips may be larger."""
 _UNLIKE_SHARE = 0.3
 """At least this share of a tool's pixels differs from the ground."""
 _LEAST_AREA_MM2 = 40.0
@@ -78,7 +78,8 @@ differs from that for other limits, the outline is in doubt."""
 _LOW_MM = 9.0
 _COARSE_PX_PER_MM = 3.5
 _FINE_PX_PER_MM = 5.0
-"""Below this resolution, blurred pixels widen the steps of light."""
+"""Below this resolution, blurred pixels widen the steps of light, so the limits of their width are
+raised."""
 
 
 def look_for(height: float | None, px_per_mm: float) -> ShadowLook:
@@ -146,7 +147,8 @@ class ToolMasks:
         roughest = max(_ROUGH * look.rough / 3, look.rough * self._usual)
         even = (free & (self._rough < roughest)) | ~ground
         reached = _reached(cv2, even, self._plain, px_per_mm)
-        # A hole may lie wholly in shadow. Use a roughness that ignores its edges, which are close.
+        # A hole may lie wholly in shadow, with its edges close to all of its pixels. So use a
+        # roughness that ignores edges.
         usual = _median(self._fine[self._plain & ground], _ROUGH)
         limit = 1.7 * usual * np.exp(-self._lightness / 2)
         like_ground = (self._colour < _NEUTRAL * noise) & (self._fine < limit)
@@ -184,7 +186,7 @@ class ToolMasks:
         return (border & shaded & (self._width > widest)).astype(np.uint8)
 
     def _with_glare(self, tool: Array) -> Array:
-        """Adds the regions beside a tool where it shines more brightly than the ground.
+        """Adds the regions beside a tool that are brighter than the ground.
 
         Such regions are glare on the tool, because light never makes the ground beside a tool
         brighter. A strip between the tool and its glare may be as bright as the ground; it is
@@ -228,7 +230,7 @@ class ToolMasks:
             if not border.any():
                 continue
             soft = np.median(self._peak[box][border]) < _SHINE_STEEP
-            # A reflection may have a sharp edge on one side.
+            # A reflection may have a sharp edge on one side, so a soft edge on 30 % is enough.
             soft |= np.percentile(self._width[box][border], 70) > widest
             if soft or (self._lightness[box][bay] > _SHINY).mean() > _SHINY_SHARE:
                 filled[box][bay] = 1
