@@ -28,8 +28,11 @@ _SHARES = (0.85, 1.15)
 """The least and largest area of the part of a notch outside its cavity, as multiples of the area of
 a half disc."""
 _FINS = 1.6
-"""The largest area that the closing in `_notch` may fill, as a multiple of the area that it fills
-at two right-angled corners. A larger area means that the notch leaves a thin fin."""
+"""The limit for thin fins between a notch and its cavity.
+
+The closing in `_notch` fills fins, and a little of two corners. It may fill at most this many times
+the area of two right-angled corners.
+"""
 _OVERLAP = 0.001
 """The overlap of a notch with its cavity, in metres, so that no thin skin is left between them."""
 
@@ -162,7 +165,7 @@ def _notch(cavity: Cavity, disc: CrossSection, radius: float, wall: float) -> Cr
         return None
     # Look for thin fins of the block between the notch and the cavity: a morphological closing of
     # the notch and cavity fills them. It also fills a little of the two corners where the notch
-    # meets the cavity, so compare the filled area with that at two right-angled corners.
+    # meets the cavity. So compare the filled area with that at two right-angled corners.
     x_min, y_min, x_max, y_max = disc.bounds()
     near = CrossSection.square((x_max - x_min + 4 * wall, y_max - y_min + 4 * wall)).translate(
         (x_min - 2 * wall, y_min - 2 * wall)

@@ -174,8 +174,7 @@ def other_grasps(proposals: list[GraspProposal]) -> tuple[Grasp, ...]:
     """Selects the grasps to try after the first of `propose_grasps`, best first.
 
     Grasps that cost much more than the first are left out. Of the others, the one nearest to the
-    centre of mass is always selected, because a tool that is held there does not turn between the
-    pads.
+    centre of mass is always selected: a tool held there does not turn between the pads.
     """
     usable = [item for item in proposals[1:] if item.cost < proposals[0].cost + _MUCH_WORSE]
     chosen = usable[:_OTHERS]

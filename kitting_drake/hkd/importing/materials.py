@@ -46,8 +46,8 @@ def bodies_of(solid: Manifold, category: str, density: float | None = None) -> l
     """Splits a tool in its frame T into one or two homogeneous bodies.
 
     A hammer is split into a steel head and a light handle, and a screwdriver into a steel blade and
-    a light handle, if the widths along the tool show where the handle ends. Any other tool is one
-    body, and so is a tool of a given density.
+    a light handle. If the widths along the tool do not show where the handle ends, it is one body.
+    Any other tool is one body, and so is a tool of a given density.
 
     Args:
         solid: the tool in mm, with its working end toward +x.

@@ -32,8 +32,10 @@ _SETTLE = 2.0
 """The simulated time after which the tool counts as at rest, in seconds."""
 _STEP, _SMALL_STEP = 1 / 128, 1 / 1024
 _SMALL_MM = 60.0
-"""The length in mm below which a shorter time step is needed, because the tool is so light that the
-usual step tilts it."""
+"""The length in mm below which a tool needs a shorter time step.
+
+It is so light that it would tilt with the usual step.
+"""
 _FRICTION = 0.5
 
 

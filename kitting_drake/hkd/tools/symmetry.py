@@ -37,8 +37,8 @@ hollow part: it is equally far from the whole wall.
 """
 
 _REACH_MM = 0.75
-"""The assumed largest distance in mm between the shift of the copy that best fits the surfaces and
-the shift that best fits the outlines."""
+"""The assumed largest distance in mm between two shifts of the copy: the one that best fits the
+surfaces, and the one that best fits the outlines."""
 
 Shift = NDArray[np.float64]
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 Array = NDArray[Any]
 
 _DARKER, _BRIGHTER, _COLOURED = 0.22, 0.12, 0.11
-"""A pixel may be a tool if it is darker or brighter than the ground, or of another colour, by at
-least this, in logarithms of light."""
+"""The least difference of a tool's pixel from the ground, in logarithms of light: if it is darker,
+brighter, or of another colour."""
 _NO_SHADOW = 1.3
 """The largest darkening by a shadow, in logarithms of light."""
 _BALL_MM = 0.9
@@ -29,8 +29,8 @@ _SHINE_STEEP = 0.6
 _STEP_REACH_MM = 1.5
 """The distance from a pixel within which a step of light is measured, in mm."""
 _SHINY, _SHINY_SHARE = 0.06, 0.25
-"""A bay or hole of a tool's mask is a reflection if more than `_SHINY_SHARE` of it is brighter than
-the ground by more than `_SHINY`, in logarithms of light."""
+"""How much brighter than the ground a reflection is, in logarithms of light; and the least share of
+a bay or hole of a tool's mask that must be so bright."""
 _SHINE_REACH_MM = 3.0
 _GLARE, _GLARE_SPREADS = 0.025, 5.0
 """The least brightness of glare above the ground: in logarithms of light, and in standard
@@ -64,8 +64,8 @@ class ShadowLook:
     rough: float
     """The largest ratio of a shadow's roughness to that of the plain ground."""
     shine: float
-    """A bay or hole is a reflection if the step of light is wider than this, in mm, on at least
-    30 % of its border with the tool."""
+    """The width in mm above which a step of light is soft. A bay or hole is a reflection if its
+    border with the tool is soft on at least 30 % of its length."""
 
 
 CAREFUL = ShadowLook(0.3, 2.0, 1.2)

@@ -1,9 +1,10 @@
 """Chooses the cuts that divide a block. They pass between the cavities where possible.
 
-A cut is a polyline from one side of the block to the opposite side that never turns back, so
+A cut is a polyline from one side of the block to the opposite side, and never turns back. So
 dynamic programming over a raster of costs finds the cheapest cut. The cost is low in solid
-material, higher across a cavity, and highest along a cavity's wall, where a cut would leave a thin
-wall. Cuts along y divide the block into strips. Cuts along x then divide each strip separately.
+material, and higher across a cavity. It is highest along a cavity's wall, where a cut would leave a
+thin wall. Cuts along y divide the block into strips. Cuts along x then divide each strip
+separately.
 """
 
 import itertools

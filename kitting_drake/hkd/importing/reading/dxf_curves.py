@@ -142,13 +142,13 @@ def _scale(
 def _likely(path: Path, document: Any, extent: float) -> tuple[float, str]:
     """Chooses the unit of a drawing that states none.
 
-    This is the only unit in which the drawing is as long as a tool, or mm if there is none.
+    This is the only unit that makes the drawing as long as a tool. If no unit does, it is mm.
 
     Returns:
         The length of the unit in mm, and a phrase for the user.
 
     Raises:
-        UserError: there are several such units.
+        UserError: several units make the drawing as long as a tool.
     """
     names = ["mm", "inches", "cm", "m"]
     if b"$MEASUREMENT" in path.read_bytes():
