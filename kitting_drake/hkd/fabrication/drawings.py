@@ -1,7 +1,7 @@
 """Draws the outlines of a block's recesses as DXF and SVG, in millimetres.
 
-Each layer (DXF) or group (SVG) holds the recesses of one kind and one depth. Cavities are
-drawn along their walls; only the STL and 3MF files have the bevel around the rims.
+Each layer (DXF) or group (SVG) holds the recesses of one kind and one depth. Cavities are drawn
+along their walls; only the STL and 3MF files have the bevel around the rims.
 """
 
 from html import escape

@@ -31,7 +31,7 @@ _FINS = 1.6
 """The limit for thin fins between a notch and its cavity.
 
 The closing in `_notch` fills fins, and a little of two corners. It may fill at most this many times
-the area of two right-angled corners.
+the area that it fills at two right-angled corners.
 """
 _OVERLAP = 0.001
 """The overlap of a notch with its cavity, in metres, so that no thin skin is left between them."""

@@ -136,7 +136,7 @@ def _prepare(request: ImportRequest, name: str, directory: Path, say: Say) -> Pr
         solid = fitted.transform(np.column_stack([tilt, np.zeros(3)]))
         length = request.length_mm or size(solid)[0]
         laid = [f"laid in its resting pose, which is tilted by {angle:.0f} degrees"]
-    # The tool did not come to rest in any of these poses, so use the first one.
+    # The tool did not come to rest in any pose that was tried, so use the first one.
     _empty(directory)
     notes.append("it rolls on a table")
     return _write(request, name, directory, first, wanted, notes, say)[0]

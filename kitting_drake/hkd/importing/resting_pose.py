@@ -44,7 +44,7 @@ def resting_tilt(sdf: Path, length_mm: float = 180.0) -> NDArray[np.float64]:
 
     Args:
         sdf: an SDFormat file with one link, in whose frame the table is at z = 0.
-        length_mm: the tool's length.
+        length_mm: the tool's length in mm, which decides the time step.
     """
     builder = DiagramBuilder()
     step = _STEP if length_mm >= _SMALL_MM else _SMALL_STEP

@@ -105,7 +105,7 @@ def weighted_tool(tool: Tool, mass: float) -> Tool:
 
 
 def _excess_moment(grasp: Grasp, root: ElementTree.Element, mass: float) -> float:
-    """Returns by how much the weight's moment exceeds `_EASY_MOMENT`, in N m; 0 if it does not."""
+    """Returns the weight's moment about the pads beyond `_EASY_MOMENT`, in N m; at least 0."""
     pose = root.findtext(".//inertial/pose") or "0 0"
     x, y, *_ = map(float, pose.split())
     lever = (x - grasp.x) * math.cos(grasp.theta) + (y - grasp.y) * math.sin(grasp.theta)

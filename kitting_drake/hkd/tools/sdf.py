@@ -10,7 +10,7 @@ from kitting_drake.hkd.tools.solids import MATERIALS
 # Contact parameters of tools: Drake's hydroelastic modulus (Pa; the default of `tool_sdf`),
 # dissipation (s/m), margin (m) and friction. With a margin above zero, Drake 1.51 fails when it
 # loads finely faceted convex hulls, or when they touch a mesh. At this modulus and steps of
-# 1/128 s, a flat bottom rests quietly without a margin.
+# 1/128 s, a flat bottom rests without jitter, even without a margin.
 HYDROELASTIC_MODULUS = 2e6
 HUNT_CROSSLEY_DISSIPATION = 20.0
 HYDROELASTIC_MARGIN = 0.0

@@ -212,8 +212,8 @@ def plate(
 def _bevelled(profile: CrossSection, z_low: float, z_high: float, bevel: float) -> Manifold:
     """Makes the solid of a bevelled plate.
 
-    The inset outline may have other vertices or loops than the original one. So the strip between
-    the two is triangulated in the plane and then lifted.
+    The profile, inset by the bevel, may have other vertices or loops than the profile itself. So
+    the strip between the two is triangulated in the plane and then lifted.
     """
     outer = profile.to_polygons()
     inner = profile.offset(-bevel, JoinType.Miter).to_polygons()

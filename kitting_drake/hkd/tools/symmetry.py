@@ -162,7 +162,7 @@ def _surface_distance(
         return float(there + back) / 2
 
     if not complete:
-        # A shift changes the distance by at most the length of the shift.
+        # A shift changes the distance by at most its own length, so this is a lower bound.
         least = mean_distance(start) - _REACH_MM
         if least >= MOST_SURFACE_DISTANCE_MM:
             return least

@@ -17,13 +17,12 @@ def outline_of_silhouette(
 ) -> CrossSection:
     """Computes a tool's outline from its silhouette, both in mm in the plane's frame.
 
-    Let H be the camera's height above the plane, and t the tool's height. In the photo, a
-    point at height h is H / (H - h) times too far from the point below the camera.
-    Where an upright side faces away from the camera, the silhouette ends at the side's top edge;
-    where it faces the camera, at the side's bottom edge. So the outline is the part of the plane
-    that the silhouette covers at every scale from 1 to (H - t) / H; the point below the camera
-    stays fixed. The widest points of a round tool are at height t / 2 on all sides, so its
-    silhouette is scaled only once.
+    Let H be the camera's height above the plane, and t the tool's height. In the photo, a point at
+    height h is H / (H - h) times too far from the point below the camera. Where an upright side
+    faces away from the camera, the silhouette ends at the side's top edge; where it faces the
+    camera, at the side's bottom edge. So the outline is the part of the plane that the silhouette
+    covers at every scale from 1 to (H - t) / H; the point below the camera stays fixed. The widest
+    points of a round tool are at height t / 2 on all sides, so its silhouette is scaled only once.
 
     Args:
         silhouette: the part of the plane that the tool hides.

@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 Array = NDArray[Any]
 
 _DARKER, _BRIGHTER, _COLOURED = 0.22, 0.12, 0.11
-"""The least difference of a tool's pixel from the ground, in logarithms of light: if it is darker,
-brighter, or of another colour."""
+"""How much darker, brighter, or different in colour a pixel must be to count as unlike the ground,
+in logarithms of light."""
 _NO_SHADOW = 1.3
 """The largest darkening by a shadow, in logarithms of light."""
 _BALL_MM = 0.9
 """The radius of the disc that `_reached` rolls over the ground, in mm."""
 _ROUGH = 0.022
-"""A surface less rough than this counts as even for `MIDDLE`, in logarithms of light."""
+"""The roughness up to which any surface counts as even for `MIDDLE`, in logarithms of light."""
 _MOST_FINE = 0.1
 _HOLE_BALL_MM = 0.6
 _STRIP_MM = 1.2

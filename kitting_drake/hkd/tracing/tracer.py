@@ -74,7 +74,7 @@ class TracedTool:
 
     name: str
     outline: CrossSection
-    """The outline in mm, in the plane's frame."""
+    """The outline in mm, in the frame of the plane that the tools lie on."""
     height_mm: float | None
     """The tool's height, for which the outline is corrected. None: it is not corrected."""
     svg: Path

@@ -16,7 +16,7 @@ _BEYOND = 1.0
 """The length by which the prisms that cut or join the pieces stick out of the block, in mm."""
 _MOST_PIECES = 40
 _UPRIGHT = 2
-"""The number of sections of the feet that lie below the upper slope of the feet."""
+"""The number of `foot_sections` that lie below the upper slope of the feet."""
 
 
 @dataclass(frozen=True)

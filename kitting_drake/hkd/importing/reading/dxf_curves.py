@@ -21,7 +21,7 @@ _MORE_UNITS_MM = {8: 25.4e-6, 9: 0.0254, 21: 1200 / 3937 * 1e3, 22: 100 / 3937 *
 survey feet and US survey inches."""
 
 _END_MARK, _TAIL = re.compile(rb"^\s*EOF\b", re.MULTILINE), 1000
-"""The end mark of a DXF, and the number of last bytes in which it is sought.
+"""The end mark of a DXF, and the number of bytes at the file's end in which it is sought.
 
 Some programs write more bytes behind the end mark.
 """
