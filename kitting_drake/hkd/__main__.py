@@ -36,7 +36,8 @@ def list_tools(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
 
 
 def generate(args: argparse.Namespace, entries: list[ToolEntry]) -> None:
-    """Regenerates models and prints how closely their collision hulls match the visual shape."""
+    """Regenerates models and prints how closely each one's collision hulls match its visual
+    shape."""
     table = Table(caption="outline, top, grip: largest error of the collision hulls, in mm")
     table.add_column("name", no_wrap=True)
     for heading in ("triangles", "hulls", "outline", "top", "grip", "tilt, deg"):
@@ -205,7 +206,7 @@ def _robot_text(path: Path) -> str:
 def _check_scenario(path: Path, console: Console) -> bool:
     """Prints how to run a kit's scenario, or why it cannot be run.
 
-    If the robot is an arm, also prints in how many scenes the arm reaches everything.
+    If the robot is an arm, also prints in how many scenes the arm reaches all tools and cavities.
 
     Returns:
         Whether the scenario can be run.

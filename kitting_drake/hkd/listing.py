@@ -92,7 +92,7 @@ def _table(records: list[dict[str, Any]]) -> Table:
         table.add_column(heading, no_wrap=True)
     for heading in ("size, mm", "mass, g", "grasp, mm"):
         table.add_column(heading, justify="right", no_wrap=True)
-    # Add this column only if a tool is symmetric, to keep the table narrow.
+    # Add a column of symmetries only if a tool has one, to keep the table narrow.
     symmetric = any(record.get("symmetry", 1) != 1 for record in records)
     if symmetric:
         table.add_column("symmetry", justify="right", no_wrap=True)

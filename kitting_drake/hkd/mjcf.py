@@ -126,7 +126,8 @@ def block_prisms(
         for low, high in itertools.pairwise(levels)
     ]
     prisms: list[NDArray[np.float64]] = []
-    # Go down from the top. Extend the region that each layer adds to prisms down to the bottom.
+    # Go through the layers from the top down. Each layer adds a region; prisms extend it to the
+    # bottom.
     above = CrossSection()
     for layer, top in zip(reversed(layers), reversed(levels[1:]), strict=True):
         prisms += [_prism(part, levels[0], top) for part in _convex_parts(layer - above)]

@@ -275,7 +275,8 @@ def _pose_in_kit(kit: Kit, index: int) -> RigidTransform:
 def _draw_poses(
     kit: Kit, tools: Sequence[RandomTool], grid: PixelGrid, rng: np.random.Generator
 ) -> tuple[RigidTransform, Sequence[RigidTransform]]:
-    """Draws poses in the world of the kit and of loose tools, which may touch or lie on each other.
+    """Draws the kit's pose and the loose tools' poses in the world. Tools may touch or lie on each
+    other.
 
     Raises:
         UserError: there is no room.
@@ -361,8 +362,8 @@ def _in_view(observation: Observation, points: NDArray[np.float64]) -> NDArray[n
 
 
 def _draw_noise(rng: np.random.Generator) -> SensorNoiseParameters:
-    """Draws parameters of the camera noise, from no noise to that of a poor camera with a poor
-    calibration."""
+    """Draws parameters of the camera noise: from no noise to the noise of a poor, badly calibrated
+    camera."""
     if rng.random() < 0.25:
         return SensorNoiseParameters()
     severity = rng.uniform(0.0, 1.0, 8)

@@ -69,8 +69,8 @@ class Footprint:
     body: tuple[Polygon, ...]
     """Convex polygons that together make up the covered part."""
     grasps: tuple[Grasp, ...] = ()
-    """Grasps at which the hand picks or places here. The open fingers need free space at each of
-    them."""
+    """Grasps at which the hand picks the object, or places an object on the fixture. The open
+    fingers need free space at each of them."""
     tall: bool = False
     """Whether the object is so high, or will become so high, that the palm cannot pass over it."""
 

@@ -73,7 +73,8 @@ class Fixture:
 
 @dataclass(frozen=True)
 class Arrivals:
-    """Objects that appear one at a time during an episode. Until then they are outside the cell.
+    """Objects that appear one at a time during an episode. Each is outside the cell until it
+    appears.
 
     The next object appears when the hand retreats or observes and no object's origin is over
     `area`.
@@ -177,18 +178,19 @@ class ActionRecord:
     place: PlanarPose
     pick_position_error_mm: float | None
     """Distance of the pick from the nearest of the object's annotated grasps, in mm; None if the
-    object has no grasps."""
+    object has no grasps or was pressed down."""
     pick_angle_error_deg: float | None
     """Angle between the pick and the nearest annotated grasp, modulo half rotations: 0 to 90
     degrees."""
     place_position_error_mm: float | None
-    """Predicted distance between the object's middle and its goal, in mm, for an object that moves
-    rigidly with the hand from pick to place; None if the object can fill no goal."""
+    """Predicted distance of the object's middle from its goal after the action, in mm. It is
+    assumed that the object moves rigidly with the hand. None if the object can fill no goal or was
+    pressed down."""
     place_angle_error_deg: float | None
-    """Predicted heading error, modulo the object's symmetry, for the same motion: 0 to 180
-    degrees."""
+    """Predicted heading error, modulo the object's symmetry, if the object moves rigidly with the
+    hand: 0 to 180 degrees."""
     peak_force_n: PeakForce | None = None
-    """The largest contact force during the action; None before a force is known."""
+    """The largest contact force during the action; None until it is measured."""
 
 
 class TaskConfig:

@@ -80,7 +80,7 @@ def build_hammer(p: HammerParameters) -> list[Part]:
     """Builds the parts of a hammer, in mm in the design frame.
 
     Raises:
-        UserError: a mapping has an unknown field.
+        UserError: `front`, `back` or `shaft` has an unknown field.
     """
     if p.front or p.back or p.shaft:
         return _assembled(p)
@@ -135,8 +135,8 @@ def _handle(p: HammerParameters) -> tuple[Shape, Shape]:
     top = p.cheek_height_mm / 2 + PROUD_MM
     end = top - p.length_mm
     eye, throat, swell = p.eye_width_mm, p.throat_width_mm, p.swell_width_mm
-    # Each row has a distance from the end, as a share of the length, and a width. Behind the head
-    # the flanks are parallel, because a gripper holds the handle there.
+    # Each row has a distance from the handle's end, as a share of the handle's length, and a width.
+    # Behind the head the flanks are parallel, because a gripper holds the handle there.
     bare = [
         (1.0, 0.86 * eye),
         (0.995, 0.9 * eye),

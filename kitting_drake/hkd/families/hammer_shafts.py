@@ -21,16 +21,17 @@ class Shaft:
     # leather).
     kind: str = "plain"
     length_mm: float = 320.0
-    # The widths along y of the straight part behind the head, of the throat where the grip begins,
-    # of the grip's swell, and of the grip's end. Then the thicknesses along z of the neck and of
-    # the grip, as shares of the widths.
+    # The widths along y: of the straight neck behind the head, of the throat where the grip begins,
+    # of the grip's swell, and of its end. Then the thicknesses along z of the neck and of the grip,
+    # as shares of their widths.
     neck_width_mm: float = 25.0
     throat_width_mm: float = 23.0
     swell_width_mm: float = 32.0
     end_width_mm: float = 34.0
     flatness: float = 0.76
     grip_flatness: float = 0.76
-    # The positions where the grip begins and where its swell is, as shares of the length.
+    # The distances from the handle's upper end to the grip and to the grip's swell, as shares of
+    # the handle's length.
     neck_share: float = 0.5
     swell_share: float = 0.72
     # The roundness of a section's corners (0 is square, 1 is round), and whether the corners are
@@ -117,7 +118,8 @@ def build_shaft(s: Shaft, top: float) -> list[Part]:
 
 
 def _grip_stations(s: Shaft) -> list[tuple[float, float]]:
-    """Returns (share of the handle's length, width) pairs along the grip."""
+    """Returns pairs along the grip: a distance from the handle's upper end, as a share of the
+    handle's length, and a width."""
     a, swell, end = s.neck_share, s.swell_width_mm, s.end_width_mm
 
     def at(t: float) -> float:
@@ -142,7 +144,8 @@ def _grip_stations(s: Shaft) -> list[tuple[float, float]]:
 
 
 def _loft(s: Shaft, top: float, stations: list[tuple[float, float, float]]) -> Shape:
-    """Makes a loft through stations, each (share of the handle's length, width, thickness).
+    """Makes a loft through stations. Each has a distance from the handle's upper end (as a share of
+    the handle's length), a width and a thickness.
 
     The collision hulls have fewer corners than the solid.
     """
@@ -163,7 +166,7 @@ def _loft(s: Shaft, top: float, stations: list[tuple[float, float, float]]) -> S
 
 
 def _bow(s: Shaft, u: float) -> float:
-    """Returns the offset of the middle line toward the face at a share `u` of the length."""
+    """Returns the middle line's offset toward the face, `u` handle lengths from the upper end."""
     t = max(0.0, (u - 0.36) / 0.64)
     return s.bow_mm * (np.sin(np.pi * min(1.0, 1.25 * t)) * 1.0 - 1.2 * max(0.0, t - 0.55))
 

@@ -153,7 +153,7 @@ def board(length: float, width: float, height: float) -> PartDesign:
         )
     base = _prism(_rectangle(length, width), _FRAME)
     parts = [Part("board", "green_grip", base.solid, base.hulls)]
-    # Add a connector at one end, a chip and a smaller component, so that the board has no symmetry.
+    # Add a connector at one end, a chip and a smaller component, which show the board's heading.
     for number, (x, y, long, wide, share) in enumerate(
         ((0.36, 0.0, 0.16, 0.7, 1.0), (-0.15, 0.12, 0.28, 0.4, 0.45), (-0.38, -0.3, 0.1, 0.16, 0.7))
     ):
@@ -446,7 +446,8 @@ def _prism(profile: np.ndarray, height: float) -> Shape:
 
 
 def _around(profile: np.ndarray) -> CrossSection:
-    """Returns a square larger than any part. If it is the only cell, a plate gets one hull."""
+    """Returns a square larger than any part. As the only cell of a `plate`, it makes the plate one
+    collision hull."""
     return CrossSection.square((2 * LONGEST_MM, 2 * LONGEST_MM), True)
 
 

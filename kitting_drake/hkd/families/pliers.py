@@ -59,8 +59,8 @@ class PliersParameters:
     steel_material: str = "steel"
     rivet_material: str = "polished_steel"
     grip_material: str = "red_grip"
-    # Other kinds of pliers have `jaws` and `levers`, or are `locking` pliers. These replace the
-    # fields above. Each of them is a Jaws, Levers or Locking, or a mapping of its fields.
+    # Other kinds of pliers have `jaws` and `levers`, or `locking`, which replace all fields above.
+    # Each of these is a Jaws, a Levers or a Locking, or a mapping of its fields.
     jaws: Jaws | dict[str, Any] | None = None
     levers: Levers | dict[str, Any] | None = None
     locking: Locking | dict[str, Any] | None = None
@@ -81,7 +81,7 @@ def build_pliers(p: PliersParameters) -> list[Part]:
     """Builds the parts of a pair of pliers, in mm in the design frame.
 
     Raises:
-        UserError: a mapping has an unknown field.
+        UserError: `jaws`, `levers` or `locking` has an unknown field.
     """
     if p.locking is not None:
         return build_locking(_typed(Locking, p.locking, "locking"))
@@ -104,8 +104,8 @@ def build_pliers(p: PliersParameters) -> list[Part]:
 
 
 def _handle_path(p: PliersParameters, count: int) -> np.ndarray:
-    """Returns the middle line (count, 2) of the upper lever's handle (y < 0), from the joint to its
-    end."""
+    """Returns the middle line (count, 2) of the upper lever's handle (y < 0), from the joint
+    outward."""
     inner = p.joint_width_mm / 2 - p.handle_width_mm / 2
     outer = p.handle_spread_mm / 2
     # The handle runs along the joint's flank, then outward; at its end it comes back a little.

@@ -41,8 +41,8 @@ class Jaws:
 def upper_jaw(j: Jaws, start: float, half: float, kind: str = "") -> np.ndarray:
     """Returns the outline (n, 2) of the upper jaw, counter-clockwise.
 
-    The joint's flanks end at x = `start` and y = +-`half`. `kind` is a key of OUTLINES; if it is
-    empty, the kind is that of the jaws.
+    The joint's flanks end at x = `start` and y = +-`half`. `kind` is a key of OUTLINES; an empty
+    string stands for `j.kind`.
     """
     back, bite = OUTLINES[kind or j.kind](j, start, half)
     root = [(start - 6.0, 0.0), (start - 6.0, half - 0.3)]
@@ -53,7 +53,7 @@ def bent(j: Jaws, outline: np.ndarray, start: float) -> np.ndarray:
     """Turns a jaw at the joint and bends it along an arc from there.
 
     Args:
-        j: the jaws, with the angles.
+        j: the jaws, with the angles `turn_deg` and `bend_deg`.
         outline: the outline (n, 2) of a straight jaw.
         start: the x at which the jaw leaves the joint.
 
@@ -293,7 +293,8 @@ def _poll(j: Jaws, start: float, half: float) -> tuple[Line, Line]:
 
 
 def _pick(j: Jaws, start: float, half: float) -> tuple[Line, Line]:
-    """Draws the other jaw of fencing pliers: a curved point for staples sticks out sideways."""
+    """Draws the jaw of fencing pliers opposite the hammer jaw: a curved point for staples sticks
+    out sideways."""
     length, out = j.length_mm, j.tip_width_mm / 2
     back = [
         (start, half),

@@ -187,7 +187,7 @@ def _lever(v: Levers, j: Jaws, upper: bool) -> Manifold:
 
 
 def _groove(v: Levers, radius: float) -> Manifold:
-    """Builds a curved channel in the top of the joint, about a point in front of the rivet."""
+    """Builds a channel in the top of the joint, in an arc about a point in front of the rivet."""
     ring = CrossSection([circle(radius + 1.1)]) - CrossSection([circle(radius - 1.1)])
     shape = ring.translate((v.joint_front_mm + 4.0, 0.35 * v.joint_width_mm))
     window = CrossSection([_lap_outline(v)]).offset(-2.0, JoinType.Miter)

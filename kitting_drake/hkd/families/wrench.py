@@ -11,7 +11,8 @@ from manifold3d import CrossSection, Manifold
 from kitting_drake.hkd.families.wrench_heads import Head, head_shape
 from kitting_drake.hkd.tools.solids import Part, Shape, blend, circle, fillet, plate, ribbon
 
-# The position of the bends of an S-shaped shank, as a share of the way from its middle to a head.
+# The distance of each bend of an S-shaped shank from the shank's middle, as a share of half the
+# distance between the heads' centres.
 _BEND = 0.56
 
 
@@ -41,7 +42,7 @@ class WrenchParameters:
     # raised panel), and the panel's width as a share of the shank's width.
     panel_depth_mm: float = 0.9
     panel_share: float = 0.58
-    # The bevel of all outer edges, and that of the shank's edges (None: the same).
+    # The bevel of the heads' outer edges, and the bevel of the shank's edges (None: the same).
     bevel_mm: float = 0.9
     shank_bevel_mm: float | None = None
     # The material, a key of solids.MATERIALS.
@@ -121,8 +122,8 @@ def _shoulders(p: WrenchParameters, head: Head, side: int) -> CrossSection:
 def _shank_cells(p: WrenchParameters) -> list[CrossSection]:
     """Returns regions that cut the shank into convex parts.
 
-    The part of the shank that a head covers is left to the head. For a straight shank, the list is
-    empty if a head has no shoulders and is neither a tail nor a spike.
+    They leave out what a head covers. The list is empty if the shank is straight and a head has no
+    shoulders; tails and spikes need none.
     """
     half, far = p.center_distance_mm / 2, 100.0
     if p.swing_mm:

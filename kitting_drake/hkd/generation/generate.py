@@ -116,7 +116,7 @@ def rest_rotation(points: np.ndarray, center_of_mass: np.ndarray) -> np.ndarray:
     """Returns R_TD (3, 3), the rotation to the stable pose nearest to the design's pose.
 
     Args:
-        points: points (n, 3) in the design frame D whose convex hull is that of the body.
+        points: points (n, 3) in the design frame D that have the same convex hull as the body.
         center_of_mass: (3,) in D, in the unit of the points.
     """
     poses = stable_poses(points, center_of_mass)

@@ -1,9 +1,9 @@
 """Grasps of tools without two parallel faces: by a corner, or by a taper.
 
-A soft pad yields to a corner. If there is a face on the other side of the tool, the closing pads
-turn the tool until this face lies flat on its pad. If there is a notch on the other side, the two
-ends of the notch touch the pad. Where the tool tapers along the pads, the ends of the pads hold the
-tool, and friction keeps it from slipping out.
+A soft pad yields to a corner. If a face is opposite the corner, the closing pads turn the tool
+until this face lies flat on its pad. If a notch is opposite the corner, the two ends of the notch
+touch the pad. Where the tool tapers along the pads, the ends of the pads hold the tool, and
+friction keeps it from slipping out.
 """
 
 import numpy as np
@@ -35,8 +35,8 @@ def corner_cost(left: Array, right: Array, column: float, touch: float) -> float
     """Returns the cost of holding a corner or a taper; None if the tool would turn or slip out of
     the pads.
 
-    The tool does not turn if the corner is between the ends of the other pad's contact, because the
-    forces of the pads then act along one line.
+    The tool does not turn if the corner lies between the ends of the opposite contact: the forces
+    of the pads then act along one line.
 
     Args:
         left: (columns, levels) the coordinate, along the closing direction, of the surface under

@@ -36,8 +36,8 @@ FLOOR_CLEARANCE = PLANNER.floor_clearance
 RELEASE_REACH = PLANNER.release_clearance + FINGERTIP_DEPTH
 """The distance beyond the gripped faces that the fingertips need when they release."""
 
-# A pad touches the parts of the surface that are at most this far behind its foremost point: in the
-# fine search, and in the coarse search.
+# A pad touches the parts of the surface that are at most this far behind its foremost point. The
+# first value is for the fine search, the second one for the coarse search.
 _TOUCH = 0.0003
 _COARSE_TOUCH = 0.0008
 # The distance from the middle of a tool in its kit to a neighbouring tool.
@@ -118,7 +118,7 @@ def _propose(
         return []
     com = np.asarray(center_of_mass, dtype=float)[:2]
 
-    # A rotation by pi only swaps the two jaws, which are alike.
+    # Search half a turn only: a rotation by pi swaps the two jaws, which are alike.
     found: list[GraspProposal] = []
     for theta in np.radians(np.arange(-90.0, 90.0, _COARSE_DEG)):
         found += _search(points, level, levels, com, float(theta), _COARSE_TOUCH, planner, corners)

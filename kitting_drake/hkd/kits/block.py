@@ -179,7 +179,7 @@ def build_block(cavities: Sequence[Cavity], parameters: KitParameters) -> Manifo
 def _add_floor(surface: _Surface, cavity: Cavity, cavities: Sequence[Cavity]) -> None:
     """Adds a cavity's floor: the bounding rectangle of the cavity's outline.
 
-    Other cavities that are at least as deep are cut out of the rectangle, because it would be a
+    Other cavities that are at least as deep are cut out of the rectangle: uncut, it would be a
     shelf or a second floor inside them.
     """
     x_min, y_min, x_max, y_max = cavity.outline.bounds()
@@ -203,7 +203,7 @@ def contact_surfaces(cavities: Sequence[Cavity], parameters: KitParameters) -> d
 
     The geometry is that of the block without its underside. The solver puts small groups of
     neighbouring triangles into bounding boxes; its cost grows with the number of boxes that an
-    object overlaps. A plain triangulation has long slivers. Their boxes overlap, and they split
+    object overlaps. A plain triangulation has long slivers, whose boxes overlap and which split
     contact patches into many polygons. Therefore:
 
     - each floor is one rectangle that extends into the solid, where nothing can touch it;

@@ -28,7 +28,8 @@ from kitting_drake.hkd.tools.tool import Tool
 _DIGITS = 7
 """The number of decimals of coordinates in files."""
 _FORMAT_VERSION = "9"
-"""The version of the files in the cache. Increase it when equal inputs give different kits."""
+"""The version of the files in the cache. Increase it when a change of the code makes another kit of
+the same tools, parameters and poses."""
 
 
 @dataclass(frozen=True)
@@ -159,7 +160,7 @@ def _write(tools: Sequence[Tool], layout: KitLayout, directory: Path) -> None:
     cavities = kit_cavities(tools, parameters, layout.poses)
     block = build_block(cavities, parameters)
     mesh = block.to_mesh()
-    # Merge vertices that have equal rounded coordinates; they would leave cracks in the surface.
+    # Merge vertices that rounding makes equal. Separate vertices would leave cracks in the surface.
     rounded = np.round(np.asarray(mesh.vert_properties, dtype=float)[:, :3], _DIGITS) + 0.0
     vertices, index = np.unique(rounded, axis=0, return_inverse=True)
     faces = index[np.asarray(mesh.tri_verts, dtype=int)]

@@ -37,8 +37,7 @@ _WIDTHS = (1.0, 0.9, 1.1, 0.8, 1.25, 1.45)
 _EXPECTED_USE = 0.60
 """The expected ratio of the area of the outlines with their walls to the rectangle's area."""
 _ELONGATION_COST = 0.10
-"""The extra cost of a rectangle with sides of 2 to 1, relative to that of a square of equal
-area."""
+"""A rectangle with sides of 2 to 1 costs more than a square of equal area by this fraction."""
 _ARC_SEGMENTS = 64
 _REACH = 1.02 * CELL / math.sqrt(2)
 """The largest distance of a point from the centre of its cell, with a margin for rounding."""
@@ -134,7 +133,8 @@ def nest_on(
     extents = [max(rotated[0].size) for rotated in parts]
     largest_first = sorted(range(len(shapes)), key=lambda i: -sizes[i])
     longest_first = sorted(range(len(shapes)), key=lambda i: -extents[i])
-    # The masks are conservative: shapes may fit although their masks need a slightly larger strip.
+    # Also try strips that are one or two cells too large. Masks are larger than their shapes, so
+    # the shapes may still fit.
     for order, lengthwise, excess in itertools.product(
         (largest_first, longest_first), (True, False), (0, 1, 2)
     ):
@@ -328,7 +328,8 @@ def _lowest_place(
 
     against_solid, against_keep_out = part.spectra(canvas)
     overlap = fft.irfft2(taken[0] * against_solid + taken[1] * against_keep_out, s=canvas)
-    # A correlation counts cells, so round it to a whole number.
+    # The correlation is the number of overlapping cells; a value below 0.5 is a zero with a
+    # rounding error.
     free = overlap[:rows, :columns] < 0.5
     first = int(np.argmax(free))
     row, column = divmod(first, columns)

@@ -20,7 +20,7 @@ _MOST_MOVE = 0.001
 """The largest move in one round of the search in `find_seat`, in metres."""
 _ROUNDS = 12
 _SETTLED = 1e-6
-"""The search ends when a round increases the room by no more than this, in metres."""
+"""The search ends when a round increases `Seat.room` by no more than this, in metres."""
 
 
 @dataclass(frozen=True)

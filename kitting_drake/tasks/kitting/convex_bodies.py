@@ -73,7 +73,7 @@ def _thinned(points: NDArray[np.float64]) -> NDArray[np.float64] | None:
     """Simplifies a convex hull so that it has no thin slivers, which break contact computations.
 
     Returns:
-        (m, 3) the corners of the simplified hull; None if all of the hull is such a sliver.
+        (m, 3) the corners of the simplified hull; None if the whole hull is a sliver.
     """
     try:
         return thinned(1e3 * points, _THINNED_MM) / 1e3

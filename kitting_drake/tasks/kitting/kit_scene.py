@@ -121,8 +121,8 @@ def _goal(
 
 
 def _seat(tool: Tool, kit: Kit, slot: int) -> RigidTransform:
-    """The pose of a tool in the cavity of a slot, in the frame of the tool for which the cavity was
-    made. These may be two tools."""
+    """The pose at which a tool is seated in the cavity of a slot, in the frame of the tool for
+    which the cavity was made. The two tools may differ."""
     model = kit.tools[slot]
     cavity = cavity_outline(model.footprint, kit.parameters.of_tool(model.name))
     seat = find_seat(tool.footprint, model.footprint, cavity)

@@ -370,8 +370,8 @@ class ToolsetKitting(_DrawnKitting):
         return self._draw_scene(tools, grid, seed)
 
     def _draw_names(self, seed: int, base: Path) -> list[str]:
-        # Use separate random streams, so that the poses depend neither on the number of toolsets
-        # nor on the lengths.
+        # Use separate random streams for tools, lengths and poses, so that a change of one draw
+        # does not change the others.
         rng = np.random.default_rng([seed, 1])
         if not self.count:
             choices = self._toolsets(base)

@@ -104,7 +104,7 @@ class StartCheck:
         return True
 
     def is_good(self, X_WTools: Sequence[RigidTransform]) -> bool:
-        """Whether the tools at rest are a valid start of the wanted kind."""
+        """Whether the tools at rest are a valid start of the requested kind."""
         (x_low, y_low), (x_high, y_high) = TABLE
         X_KW = self._drawn.X_WKit.inverse()
         for index, (points, X) in enumerate(zip(self._points, X_WTools, strict=True)):

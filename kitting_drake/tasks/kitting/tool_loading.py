@@ -47,7 +47,7 @@ def _load_tool(name: str, base: Path, field: str) -> Tool:
 
 
 def tool_files(names: Iterable[str], base: Path) -> list[Path]:
-    """Returns the files in the folders of tools, whose names are as for `load_tools`."""
+    """Returns the files in the folders of tools. For the arguments see `load_tools`."""
     folders = [tool.directory for tool in load_tools(names, base)]
     return [path for folder in folders for path in sorted(folder.iterdir()) if path.is_file()]
 

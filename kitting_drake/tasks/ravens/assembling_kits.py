@@ -53,7 +53,8 @@ def _kit() -> KitParameters:
 
 @dataclass
 class AssemblingKits(PoseTask):
-    """Five flat shapes are put into the cavities of a kit. Unlike in Ravens, these are hollow.
+    """Five flat shapes are put into the cavities of a kit. In Ravens, the cavities are only flat
+    dark shapes on the kit.
 
     Each episode draws the shapes, their places in the kit, and all poses. Success is measured as in
     Ravens. The results also contain ADD-S, and the success by the measure of ManiSkill's task of

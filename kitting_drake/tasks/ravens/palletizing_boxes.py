@@ -46,7 +46,7 @@ _END_GAP = 0.01
 """Gap between the ends of two boxes in a line, in metres."""
 _TARGET_PITCH = 0.076
 """Distance between the middles of the three lines of boxes on the pallet, in metres. It leaves room
-for a finger of 26.3 mm between two boxes."""
+for a finger of 26.3 mm between two lines."""
 
 _POINT_SPACING = 0.02
 """Spacing of the points that are used to measure the share of a box inside the zone, in metres."""

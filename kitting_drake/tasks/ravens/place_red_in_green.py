@@ -41,7 +41,7 @@ class PlaceRedInGreen(RavensTask):
     # The colours define the goals, and the task has its own distractors.
     not_perturbed = ("colour", "distractors")
 
-    # Largest number of green bowls. The number of red cubes is at most that of bowls.
+    # Largest number of green bowls. There are at most as many red cubes as green bowls.
     bowls: int = bounded(3, 1, 6)
 
     # Number of cubes and bowls of other colours.

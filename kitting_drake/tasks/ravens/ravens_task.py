@@ -72,8 +72,8 @@ class PoseTask(RavensTask):
     """A task whose objects must come to rest in given poses."""
 
     # An object is in place if its horizontal distance from its goal is below `position_threshold`,
-    # in m, and the difference of headings, modulo the object's symmetry, is below
-    # `angle_threshold_deg`, in degrees.
+    # in m, and its heading error below `angle_threshold_deg`, in degrees. The heading error is
+    # modulo the object's symmetry.
     position_threshold: float = bounded(0.01, 1e-4, 0.5)
     angle_threshold_deg: float = bounded(15.0, 0.1, 180.0)
 

@@ -44,8 +44,8 @@ _BASE = Footprint(
 class StackBlockPyramid(PoseTask):
     """Six cubes are stacked into a pyramid.
 
-    The demonstrator grasps a cube on its centre line along y and gives it the heading of the base,
-    so that the jaws open across the row.
+    The demonstrator grasps a cube on its centre line along y and gives it the heading of the base.
+    The jaws then open across the row.
     """
 
     # The colour of a cube determines its place.
