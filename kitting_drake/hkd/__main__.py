@@ -241,7 +241,7 @@ def _reach_note(scenario: Scenario, base: Path) -> str:
     """Says in how many of `_SCENES` scenes an arm reaches all tools and cavities of a kit.
 
     Raises:
-        UserError: the arm cannot reach its home.
+        UserError: the arm cannot reach its home position.
     """
     from kitting_drake.station.robot import make_motion
     from kitting_drake.station.scene_reach import scene_problems

@@ -40,7 +40,7 @@ def measure_grasp(tool: Tool, x: float, y: float, theta: float) -> Grasp | None:
     """Measures the grasp that results when the jaws close at a given pose.
 
     Args:
-        tool: the tool, at rest in its frame T.
+        tool: the tool; T is its frame.
         x: the x of the middle of the pads in T, in metres.
         y: the y of the middle of the pads in T, in metres. Closing jaws centre the tool, so only
             the component of (x, y) along the pads matters.
@@ -75,8 +75,8 @@ def save_grasp(tool: Tool, grasp: Grasp, models: Path = MODELS) -> None:
         models: the folder with the catalogue in `tools/`.
 
     Raises:
-        UserError: the tool is too wide for the jaws there, or the generator rejects the grasp.
-            Nothing is changed then.
+        UserError: the tool is too wide for the jaws at the grasp, or the generator rejects the
+            grasp. Nothing is changed then.
     """
     if grasp.width > WIDEST:
         raise UserError(

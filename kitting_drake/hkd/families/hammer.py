@@ -28,7 +28,7 @@ class HammerParameters:
     length_mm: float = 330.0
     # The distance from the eye's middle to the striking face.
     face_reach_mm: float = 56.0
-    # The thickness of the cheeks along z.
+    # The thickness along z of the cheeks, which are the block around the eye.
     head_thickness_mm: float = 30.0
     # The cheeks' height along x and their length along y.
     cheek_height_mm: float = 32.0

@@ -56,7 +56,7 @@ def _section(width: float, thickness: float, roundness: float, segments: int) ->
 
 
 def octagon_corners(width: float, thickness: float) -> list[tuple[float, float]]:
-    """Returns the corners of an octagon: a rectangle around the origin without its corners."""
+    """Returns the corners of an octagon: a rectangle around the origin with cut corners."""
     y, z, cut = width / 2, thickness / 2, 0.27 * thickness
     return [
         (-y + cut, -z), (y - cut, -z), (y, -z + cut), (y, z - cut),

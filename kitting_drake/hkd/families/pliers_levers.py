@@ -34,7 +34,7 @@ class Levers:
     origin."""
 
     thickness_mm: float = 12.0
-    # The width across the parallel flanks of the joint, and its length behind the rivet.
+    # The width across the parallel flanks of the joint, and the flanks' length behind the rivet.
     joint_width_mm: float = 28.0
     joint_back_mm: float = 22.0
     # The distance behind the rivet up to which the handles continue in line with the flanks.
@@ -73,7 +73,7 @@ def build_levers(v: Levers, j: Jaws) -> list[Part]:
     upper, lower = _lever(v, j, True), _lever(v, j, False)
     steel = Part("steel", v.steel_material, upper + lower, _steel_hulls(v, j))
     rivet = _rivet(v)
-    # The rivet's head needs no hull if the sleeves are higher than it.
+    # Sleeves that are higher than the rivet's head keep other bodies off it, so it needs no hull.
     hidden = v.grip_length_mm and v.grip_thickness_mm > v.thickness_mm + 2.6
     parts = [Part("rivet", v.rivet_material, rivet.solid, [] if hidden else rivet.hulls), steel]
     if v.grip_length_mm:

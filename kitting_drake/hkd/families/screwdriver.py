@@ -61,7 +61,7 @@ def build_screwdriver(p: ScrewdriverParameters) -> list[Part]:
     """Builds the parts of a screwdriver, in mm in the design frame.
 
     Raises:
-        ValueError: the handle or the tip is not known.
+        ValueError: `handle` or `tip` is not a known kind.
     """
     if p.handle == "offset":
         return _offset_driver(p)

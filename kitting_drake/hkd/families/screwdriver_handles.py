@@ -34,7 +34,7 @@ class Zone(NamedTuple):
 
 
 class Style(NamedTuple):
-    """The style of a handle."""
+    """The shape of a handle and its zones of different materials."""
 
     # A function of width, height and flute depth that returns the profile (n, 2), always with the
     # same n.

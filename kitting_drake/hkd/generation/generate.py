@@ -73,8 +73,8 @@ class Report:
     bottom_error_mm: float
     top_error_mm: float
     grip_error_mm: float
-    # The variation of the gripped faces along the pads, and how far the tool between the fingers
-    # stands out beyond the gripped faces.
+    # How much the position of a gripped face varies along the pads, and how far the tool between
+    # the fingers stands out beyond the gripped faces.
     grip_flatness_mm: float
     finger_overhang_mm: float
     # The tilt of the stable pose relative to the design's pose.
@@ -262,7 +262,7 @@ class _GripReport:
     """Measurements of a grasp; lengths in mm."""
 
     width: float
-    # The variation of the gripped faces along the pads.
+    # How much the position of a gripped face varies along the pads.
     flatness: float
     # How far the tool between the fingers stands out beyond the gripped faces.
     overhang: float
@@ -271,7 +271,7 @@ class _GripReport:
 
 
 def _measure_grasp(entry: ToolEntry, solid: Manifold) -> _GripReport:
-    """Measures the annotated grasp on a tool at rest in its frame T.
+    """Measures the annotated grasp of a tool, whose solid is in its frame T, in mm.
 
     Raises:
         CatalogueError: the jaws cannot hold the tool by this grasp.

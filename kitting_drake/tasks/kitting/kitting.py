@@ -109,7 +109,7 @@ class KittingTask(TaskConfig):
 class _DrawnKitting(KittingTask):
     """Kitting tasks that draw the poses of tools and kit from the seed."""
 
-    # Least distance between tools and kit, in m.
+    # Least distance between any two of the tools and kits, in m.
     spacing: float = bounded(0.008, 0.0, 0.2)
 
     # Tools and kit are rotated by random angles between minus and plus this, in degrees.

@@ -75,7 +75,7 @@ class AssemblingKits(PoseTask):
     # The kit block and its cavities.
     kit: KitParameters = field(default_factory=_kit)
 
-    # Least distance between the shapes and the kit on the table, in m.
+    # Least distance on the table between two shapes, and between a shape and the kit, in m.
     spacing: float = bounded(0.008, 0.0, 0.2)
 
     causes = diagnosis.CAUSES

@@ -18,8 +18,8 @@ TOPPLED = "toppled"
 PREREQUISITE_MISSING = "prerequisite missing"
 
 _GRASP_STREAM = 2
-"""Number of the random stream of the demonstrator's grasps, so that other draws do not depend on
-them."""
+"""The demonstrator's grasps have a random stream with this number, so that other draws do not
+depend on them."""
 
 _UPRIGHT = math.cos(math.radians(20.0))
 """Cosine of the tilt above which an object counts as toppled."""
@@ -62,7 +62,8 @@ class RavensTask(TaskConfig):
         if X_WB[index].rotation().matrix()[2, 2] < _UPRIGHT:
             return TOPPLED
         if scene.success.share(placement, X_WB[index]) > 1 - 1e-9:
-            # The object is in place, but the goals that must be filled before its own are not.
+            # The object is in place, but a goal that must be filled before the object's goal is
+            # not.
             return PREREQUISITE_MISSING
         return cause
 
