@@ -1,5 +1,5 @@
-"""A cache of folders that can be recreated. Folders appear atomically, and the oldest ones are
-removed."""
+"""A cache of folders that can be recreated. Folders appear atomically, and the least recently used
+ones are removed."""
 
 import contextlib
 import os
@@ -12,10 +12,11 @@ from pathlib import Path
 from kitting_drake.common.errors import MachineError
 
 KEPT_ENTRIES = 1000
-"""Number of newest folders that `prune` always keeps."""
+"""Number of most recently used folders that `prune` always keeps."""
 
 YOUNGEST_REMOVED = 3600.0
-"""`prune` keeps folders younger than this, in seconds, because a running process may need them."""
+"""`prune` keeps folders used within this time, in seconds, because a running process may need
+them."""
 
 _SCRATCH = ".making-"
 
@@ -24,8 +25,7 @@ def cached_folder(final: Path, files: Sequence[str], write: Callable[[Path], obj
     """Returns a folder of the cache, after creating it if it is missing or damaged.
 
     The folder appears atomically, so several processes may create it at the same time. Every use
-    renews its modification time, so that `prune` removes the folders that have not been used for
-    longest.
+    renews the folder's modification time, by which `prune` finds the least recently used folders.
 
     Args:
         final: the folder. Its name must identify its content.
@@ -67,8 +67,8 @@ def _is_complete(folder: Path, files: Sequence[str]) -> bool:
 def prune(parent: Path) -> None:
     """Removes the least recently used folders in `parent`.
 
-    It keeps the newest `KEPT_ENTRIES` folders, and all that are younger than `YOUNGEST_REMOVED`.
-    Scratch folders of killed processes are removed if they are older than `YOUNGEST_REMOVED`.
+    The `KEPT_ENTRIES` most recently used folders are kept, and all folders that were used less than
+    `YOUNGEST_REMOVED` ago. Older scratch folders of killed processes are removed as well.
     """
     entries: list[tuple[float, Path]] = []
     for path in parent.iterdir():
@@ -81,7 +81,7 @@ def prune(parent: Path) -> None:
     for path in [*(path for _, path in kept[KEPT_ENTRIES:]), *scratch]:
         with contextlib.suppress(OSError):
             if time.time() - path.stat().st_mtime > YOUNGEST_REMOVED:
-                # Move it away first, so that no process finds it half deleted.
+                # Move the folder away first, so that no process finds it half deleted.
                 with tempfile.TemporaryDirectory(dir=parent, prefix=_SCRATCH) as folder:
                     os.rename(path, Path(folder) / "removed")
                     shutil.rmtree(Path(folder) / "removed", ignore_errors=True)

@@ -40,7 +40,7 @@ class RayWorkers:
     """The CPUs of a Ray cluster, as `Workers`. Use it in a `with` statement.
 
     A call occupies one CPU and runs in a fresh process. If its node dies, the call is retried on
-    another node. Only this process writes files.
+    another node. Only the calling process writes files.
     """
 
     def __init__(self, address: str, runtime_env: dict[str, Any]) -> None:
@@ -61,8 +61,8 @@ class RayWorkers:
         """Connects to the cluster.
 
         Raises:
-            UserError: Ray is not installed, there is no such cluster, or it rejects the runtime
-                environment.
+            UserError: Ray is not installed, no cluster is at the address, or the cluster rejects
+                the runtime environment.
         """
         # Ray reports a dead node in one message. This setting keeps it from also printing the
         # node's log.
@@ -178,7 +178,7 @@ def _answer(versions_wanted: dict[str, str], call: bytes) -> bytes:
     try:
         found = versions()
         if found != versions_wanted:
-            # Compare the packages of both machines, because one machine may lack a package.
+            # Compare the packages of this machine and the node, because either may lack one.
             names = (*versions_wanted, *found)
             name = next(key for key in names if found.get(key) != versions_wanted.get(key))
             there, here = (which.get(name, "none") for which in (found, versions_wanted))

@@ -109,8 +109,7 @@ def claim_folder(folder: Path, name: str, described: Any, *, of: str) -> None:
             raise UserError(
                 f"{path} is damaged: give another --output, or delete {folder}"
             ) from error
-        # The comparison includes the order of mappings, because the order of tools or paints
-        # matters.
+        # Compare the order of keys as well, because the order of tools or paints matters.
         if json.dumps(found) != json.dumps(described):
             raise UserError(
                 f"{folder} holds the files of another {of}"

@@ -16,8 +16,7 @@ from kitting_drake.common.provenance import source_digest
 def modules_beside(base: Path) -> Iterator[None]:
     """Appends a folder to Python's module path for the duration of a `with` block.
 
-    As usual in Python, a module is not imported again if a module of its name was imported
-    before.
+    As usual in Python, a module is not imported if one of the same name was imported before.
 
     Args:
         base: the folder of the scenario's file.

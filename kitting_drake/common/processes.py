@@ -45,7 +45,7 @@ class ProcessCrashed:
         return self.exit_code in (-signal.SIGKILL, -signal.SIGTERM)
 
     def killed_twice(self, seed: int) -> UserError:
-        """The error to raise if the retry was also killed."""
+        """The error to raise if a seed was tried again and its process was killed again."""
         return UserError(
             f"the process of seed {seed} was killed twice, perhaps for lack of memory: run the "
             "command again with fewer --workers, or fewer CPUs per node, to resume"

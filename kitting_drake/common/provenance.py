@@ -23,7 +23,7 @@ _UNCOMMITTED = "+"
 
 
 def versions() -> dict[str, str]:
-    """The versions of this package and its main dependencies. Drake's is included if it is
+    """The versions of this package and its main dependencies; that of Drake only if Drake is
     installed."""
     found = {"kitting_drake": kitting_drake.__version__}
     with contextlib.suppress(importlib.metadata.PackageNotFoundError):

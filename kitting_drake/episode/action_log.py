@@ -149,10 +149,10 @@ class ActionLog:
 def _place_errors(
     item: PlacedObject, goal: Goal, X_WGoal: RigidTransform, arrival: RigidTransform
 ) -> tuple[float, float, float]:
-    """Returns how an object's pose after the action differs from its goal pose: the mean
-    displacement (m), the distance of the object's middle from its goal (m), and the angle (rad).
+    """Returns how an object's pose after the action differs from its goal pose: the `displacement`
+    (m), the distance of the object's middle from where it should be (m), and the angle (rad).
 
-    Only the planar arrival pose is known, so heights are not compared.
+    Only the planar pose after the action is known, so heights are not compared.
     """
     flat = RigidTransform(
         X_WGoal.rotation(), [*X_WGoal.translation()[:2], arrival.translation()[2]]

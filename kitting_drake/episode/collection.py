@@ -94,7 +94,7 @@ class Collection:
         self.assembled = len(contents.seeds)
         self._accepted |= dict.fromkeys(contents.seeds, self.path)
         self._rejected |= {item.seed: item for item in contents.rejected}
-        # A process that was killed after the merge has left its parts.
+        # Parts remain if an earlier process was killed after merging them.
         self._remove_parts([*contents.seeds, *(item.seed for item in contents.rejected)])
 
     def collect(

@@ -29,7 +29,8 @@ class ObjectResult:
     name: str
     category: str
     add_s_mm: float | None
-    """ADD-S, in mm. This and the other errors are None if no goal was left for the object."""
+    """ADD-S between the object's pose and its goal, in mm. This and the other errors are None if no
+    goal was left for the object."""
     success: bool
     """Whether the object fills its goal by the task's success predicate. In kitting this is the
     paper's predicate: ADD-S below a threshold."""
@@ -43,8 +44,8 @@ class ObjectResult:
     cause: str | None
     """Why the object failed, one of the task's `causes`; None for a success."""
     measures: dict[str, bool] = dataclasses.field(default_factory=dict)
-    """For each of the scene's further `measures`, whether it counts the object as a success. The
-    key `strict` holds `strict_success`. Empty if the scene has no further measures."""
+    """Whether the object is a success by each of `Scene.measures` and, with the key `strict`, by
+    `strict_success`. Empty if the scene has no such measures."""
 
 
 @dataclasses.dataclass
@@ -106,9 +107,8 @@ def run_episode(
 ) -> EpisodeResult:
     """Runs an episode until the planner is done and the objects rest, or until the time limit.
 
-    If the policy or the simulation raises an error (for example because the contact solver does not
-    converge), or at Ctrl-C, only the episode ends, not the program. The result then has `failure`
-    or `interrupted` set.
+    After Ctrl-C, or an error of the policy or the simulation, only the episode ends, not the
+    program. The result then has `failure` or `interrupted` set.
 
     Args:
         diagram: the outermost Diagram, with the station and a connected policy.
@@ -332,7 +332,7 @@ class _Monitor:
         self.done_since: float | None = None
 
     def step(self, root_context: Context) -> EventStatus:
-        """Checks the state after a step."""
+        """Notifies the observers after a step, and decides whether the episode ends or pauses."""
         station = self._station
         self.tell(root_context)
         if self._log is not None:

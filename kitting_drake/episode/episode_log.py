@@ -145,7 +145,8 @@ class EpisodeLog:
 
             - `action_time` (k), its start;
             - `pick`, `place` (k, 3), x, y and theta; `press` (k), whether the action presses;
-            - `observation_height` (k, rows, cols), the policy's o_t; missing without cameras.
+            - `observation_height` (k, rows, cols), the heights that the policy observed; missing
+              without cameras.
 
             Names: `joint_names`, `mode_names`, `object_names`.
         """

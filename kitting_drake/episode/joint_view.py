@@ -55,9 +55,8 @@ class JointView:
         return np.array([*state[:j], sum(state[j : j + FINGERS])], np.float32)
 
     def command(self, root_context: Context) -> NDArray[np.float32]:
-        """(entries) the planner's present targets, in rad and m. If the planner applies a closing
-        force, the opening is smaller than the planner's, so that the fingers' springs alone pull
-        with the same force."""
+        """(entries) the planner's present targets, in rad and m. A closing force that the planner
+        commands is converted to a smaller target opening with the same effect."""
         joints = self._port(root_context, "commanded")[: self._joints]
         opening = self._port(root_context, "commanded_opening")[0]
         force = self._port(root_context, "commanded_closing_force")[0]

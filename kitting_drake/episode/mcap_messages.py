@@ -83,7 +83,8 @@ def mcap_messages(arrays: Mapping[str, NDArray[Any]]) -> Iterator[Message]:
     - `/mode`: `String`, the planner's mode when it changes.
     - `/tf`: `TFMessage`, hand and objects in the frame `world`, 32 times a second.
     - `/pick`, `/place`: `PoseStamped` at the start of each action.
-    - `/observation_height`: `Image` of 32-bit floats, o_t in metres.
+    - `/observation_height`: `Image` of 32-bit floats, the heights that the policy observed, in
+      metres.
 
     Args:
         arrays: the arrays of `EpisodeLog.arrays`.

@@ -32,9 +32,8 @@ def observation_space(scenario: Scenario, *, cameras: bool) -> spaces.Dict:
     - `colour` (rows, cols, 3);
     - `height` (rows, cols), in metres above `heightmap.z_min`, by default the table;
     - `valid` and `in_view` (rows, cols);
-    - `cameras`, if it is requested: for each camera `colour` (height, width, 3), and `depth`
-      (height, width) in metres, which is 0 for points that are too near and infinite for points
-      that are too far.
+    - `cameras`, if requested: for each camera `colour` (height, width, 3), and `depth` (height,
+      width) in metres. Depth is 0 for points that are too near, and infinite for points too far.
     """
     grid = scenario.heightmap.grid()
     depth_range = grid.z_max - grid.z_min

@@ -1,7 +1,7 @@
 """Estimates the probability that a pick and place succeeds.
 
 The estimate is a logistic regression on facts about the decision: the networks' certainty, how well
-the outlines of object and recess fit, the room for the jaws, and how much is seen. `benchmark
+the outlines of object and recess fit, how well the jaws can grip, and how much is seen. `benchmark
 reliability` fits it to scenes with random cameras, on which no network was trained. This is not in
 the paper.
 """
@@ -96,7 +96,7 @@ def certainty(decision: Decision, resolution: float) -> dict[str, float]:
     - `something_to_pick` (for a stop, `nothing_to_pick`): the predicted probability that there is
       something (or nothing) left to pick; missing if the networks have no stop class;
     - `pick`: the probability of the pixels within 1 cm of the pick, divided by that of the pixels
-      within 6 cm, so that other objects do not lower it; missing for a stop;
+      within 6 cm, which leaves other objects out; missing for a stop;
     - `angle`: the probability of the angles within 10 degrees of the chosen one; missing for a
       stop.
     """

@@ -39,7 +39,7 @@ class Decision:
     """(n,): p(theta | u, v) at the angles pi i / n."""
     place_map: NDArray[np.float32]
     """(rows, cols): each pixel's best score over all rotations, minus the best score of all pixels,
-    in nats, as found by a coarse search."""
+    in nats. The scores may be interpolated from a coarse search."""
     pick_pixel: NDArray[np.float64]
     """(row, col) of the pick."""
     place_pixel: NDArray[np.float64]
@@ -49,9 +49,9 @@ class Decision:
     belongs: bool = False
     """Whether the outlines show that the object fits into the recess at the place."""
     moved_pick: float = 0.0
-    """How far the stages moved the pick from the networks' proposal, in mm; at most 40."""
+    """How far the stages moved the pick from the networks' proposal, in mm; clipped at 40."""
     moved_place: float = 0.0
-    """How far the stages moved the place from the networks' proposal, in mm; at most 20."""
+    """How far the stages moved the place from the networks' proposal, in mm; clipped at 20."""
     geometry: Evidence = dataclasses.field(default_factory=dict)
     """Geometric facts about the action (`geometric_evidence`); empty if outlines are not used."""
     kit_seen: bool | None = None

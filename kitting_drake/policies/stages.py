@@ -24,8 +24,8 @@ from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import wrap_to_pi
 
 _AS_GOOD = 2.0
-"""A rotation counts as equally good as the best one if its score is at most this many nats lower,
-and its place is within `_SAME_PLACE` of the best one's."""
+"""A rotation counts as equally good if its score is at most this many nats below the best score and
+its place is within `_SAME_PLACE` of the best rotation's place."""
 _SAME_PLACE = 4.0
 """The largest distance, in pixels, between the places of rotations that count as equally good."""
 _TRIES = 4
@@ -117,7 +117,7 @@ class JawRoom:
 
 @dataclass(frozen=True)
 class OutlinePlace:
-    """Fits the place to the outlines of object and recess where they agree.
+    """Moves the place so that the object's outline fits the recess's, if the outlines agree.
 
     The fit starts at the networks' place (`refine_place`). If it fails, the stage uses the recess
     into which the object fits (`Inventory.pairs`), if there is one.

@@ -97,7 +97,7 @@ class EpisodeFrames:
     action: NDArray[np.float32]
     """(n, entries) commanded positions, in m and rad, at the time of the next frame."""
     reward: NDArray[np.float32]
-    """(n) for each frame, the task's reward that is earned until the next frame."""
+    """(n) the increase of the task's reward from each frame to the next."""
     success: NDArray[np.bool_]
     """(n) for each frame, whether every goal is filled at the next frame."""
     images: dict[str, list[bytes]] = field(default_factory=dict)

@@ -276,7 +276,7 @@ def augment(
     """Returns a sample after a random SE(2) motion of the scene that keeps the pick and the place
     inside the image.
 
-    After a hundred draws without such a motion the sample is not moved.
+    If a hundred draws give no such motion, the sample is not moved.
 
     Args:
         sample: the sample.

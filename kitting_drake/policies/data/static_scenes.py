@@ -6,7 +6,7 @@ and `versions`, and these datasets for n scenes with m actions in all:
 
 - `height` (n, rows, cols), uint16, steps of 0.1 mm above `grid.z_min`: o_t, with unseen pixels
   filled in (`Observation.filled_height`);
-- `actions` (m, 8): number of the object, cost of the grasp, pick x, y, theta, place x, y, theta, in
+- `actions` (m, 8): index of the object, cost of the grasp, pick x, y, theta, place x, y, theta, in
   metres and radians;
 - `first` (n + 1,): scene i has the actions from `first[i]` up to but not including `first[i + 1]`.
   In a scene without actions nothing is left to pick;
@@ -56,7 +56,7 @@ class StaticScene:
     """One observed scene."""
 
     height: NDArray[np.uint16]
-    """(rows, cols) heights above the table, in steps of 0.1 mm."""
+    """(rows, cols) heights above `grid.z_min`, in steps of 0.1 mm."""
     actions: NDArray[np.float64]
     """(m, 8) the scene's actions, one in each row; for the columns see the module's docstring."""
 
@@ -159,13 +159,12 @@ def read_static_scenes(path: Path) -> StaticScenes:
         with h5py.File(path) as file:
             if file.attrs.get("format") != FORMAT:
                 raise UserError(
-                    "it is not a file of static scenes: make one with "
-                    "python -m kitting_drake.draw_scenes"
+                    "not a file of static scenes: make one with python -m kitting_drake.draw_scenes"
                 )
             version = file.attrs["format_version"]
             if version != FORMAT_VERSION:
                 raise UserError(
-                    f"it has format version {version}, but version {FORMAT_VERSION} is needed: "
+                    f"the format version is {version}, but version {FORMAT_VERSION} is needed: "
                     "draw the scenes again"
                 )
             grid = PixelGrid(**json.loads(file.attrs["grid"]))
@@ -190,17 +189,17 @@ def _check(heights: NDArray, actions: NDArray, first: NDArray, grid: PixelGrid) 
     if heights.shape[1:] != grid.shape or heights.dtype != np.uint16:
         rows, cols = grid.shape
         raise ValueError(
-            f"its heights must be uint16 with the shape (scenes, {rows}, {cols}), but are "
+            f"`height` must be uint16 with the shape (scenes, {rows}, {cols}), but is "
             f"{heights.dtype} with the shape {heights.shape}"
         )
     if actions.ndim != 2 or actions.shape[1] != 8 or not np.isfinite(actions).all():
         raise ValueError(
-            f"its actions must be rows of 8 finite numbers, but have the shape {actions.shape}"
+            f"`actions` must be rows of 8 finite numbers, but has the shape {actions.shape}"
         )
     bounds = first.shape == (len(heights) + 1,) and first.dtype.kind in "iu"
     if not bounds or first[0] != 0 or first[-1] != len(actions) or (np.diff(first) < 0).any():
         raise ValueError(
-            f"its dataset `first` must be {len(heights) + 1} integers that begin with 0, never "
+            f"`first` must be {len(heights) + 1} integers that begin with 0, never "
             f"decrease, and end with the number of actions, {len(actions)}"
         )
 
@@ -210,8 +209,7 @@ def _check_batches(ends: NDArray, count: int) -> None:
     whole = ends.ndim == 1 and ends.dtype.kind in "iu" and len(ends) > 0
     if not whole or ends[-1] != count or (np.diff(ends) <= 0).any():
         raise ValueError(
-            "its dataset `batch_ends` must be increasing integers that end with the number of "
-            f"scenes, {count}"
+            f"`batch_ends` must be increasing integers that end with the number of scenes, {count}"
         )
 
 

@@ -88,8 +88,8 @@ class TrainingData:
 
     @property
     def unrelated(self) -> tuple[int, ...]:
-        """The places at which the data can be split into two unrelated parts, each as the number of
-        items before the split.
+        """The places at which the data can be split into two unrelated parts. Each is given as the
+        number of items before the split.
 
         Static scenes share tools within a batch; demonstrations are independent.
         """
@@ -207,8 +207,8 @@ def read_training_data(path: Path) -> TrainingData:
     else:
         demonstrations: Demonstrations = read_demonstrations(path)
         origin = demonstrations.origin
-        # The lowest height of a simulated scenario's grid may be below the table. In recordings
-        # from a real robot it is the table's height.
+        # In simulation `z_min` may be below the table. Recordings from a real robot have no such
+        # field: their lowest height is the table's.
         z_min = (origin.scenario.get("heightmap") or {}).get("z_min", 0.0)
         if z_min != 0:
             raise UserError(

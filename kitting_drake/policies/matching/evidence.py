@@ -27,7 +27,8 @@ _REGION_FACTS = (
     *("is_object", "object_seen", "depth", "hole", "size", "apart"),
     *("over_recess", "cost", "reverse", "spread", "rival", "offset", "too_high", "recess_seen"),
 )
-"""The facts that are zero without an object under the pick or a recess under the place."""
+"""Without an object under the pick all of these facts are zero; without a recess under the place
+those of the second row."""
 _FAR = 20.0
 """Upper limit of the distance from other objects, in mm."""
 _WORST_FIT = 0.002
@@ -109,8 +110,8 @@ def _fit_facts(
     rotation: float,
     place: Array,
 ) -> Evidence:
-    """Returns facts about the fit of a placed object to the recess under it; empty if there is
-    none."""
+    """Returns facts about the fit of a placed object to the recess under it; empty if no recess is
+    there."""
     overlaps = [int((item.mask & target).sum()) for item in segmentation.recesses]
     if not overlaps or not max(overlaps):
         return {}

@@ -14,8 +14,8 @@ from kitting_drake.policies.matching.splitting import split_touching
 from systems.signals import Attempt, LeftOver, Observation, PlanarPose
 
 _THERE = 0.015
-"""An object within this distance of an earlier pick or place, in metres, counts as the one that was
-moved."""
+"""An object within this distance of an earlier pick or place, in metres, counts as the object that
+was picked or placed there."""
 _MOST_TRIES = 3
 """An object is tried at most this many times."""
 _LEAST_SHARE = 0.5
@@ -75,7 +75,8 @@ class Inventory:
     def strangers(self) -> tuple[Region, ...]:
         """The objects that fit into no recess and were not tried too often, largest first.
 
-        Such a region may be several touching objects, or one object whose outline is partly hidden.
+        Each is a region of o_t. It may be several touching objects, or one whose outline is partly
+        hidden.
         """
         paired = {pair.item for pair in self.pairs}
         objects = enumerate(self.segmentation.objects)

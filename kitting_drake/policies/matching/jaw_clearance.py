@@ -99,7 +99,7 @@ def jaw_grasps(
         planner: parameters that say how deep the fingertips go and how wide the jaws open.
         support: height of the object's support above the table, in metres.
         balance: (row, col) of the object's centre of mass, if known. Otherwise the centre of the
-            volume below its surface is used.
+            volume below the object's surface is used.
     """
     relief = segmentation.relief
     pixels = region.pixels

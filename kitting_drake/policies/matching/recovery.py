@@ -40,8 +40,8 @@ def recovery_action(
     """Returns an action that presses down or takes out a protruding object; None if no object
     protrudes or no correction is feasible.
 
-    Higher objects come first. An object that was already taken out and placed again is not taken
-    out once more.
+    Objects that protrude more come first. An object that was already taken out and placed again is
+    not taken out once more.
 
     Args:
         inventory: the objects and recesses of the observation.

@@ -1,10 +1,10 @@
 """Refines the place and the grasp that networks predict, by the geometry of o_t.
 
-The place is refined by fitting the object's outline to the recess, and the grasp by the room for
-the jaws. The fit corrects errors of millimetres and degrees. It also decides between two rotations
-that differ by half a turn, even for an object whose two ends differ little. If the outlines do not
-agree, for instance because the recess is hidden or there is none, the prediction stays as it is.
-This is not in the paper.
+The place is refined by fitting the object's outline to the recess. The fit corrects errors of
+millimetres and degrees. It also decides between two rotations that differ by half a turn, even for
+an object whose two ends differ little. If the outlines do not agree, for instance because the
+recess is hidden or there is none, the prediction stays as it is. A grasp is replaced if the jaws
+would hit something there. This is not in the paper.
 """
 
 from __future__ import annotations
@@ -96,8 +96,8 @@ def refine_place(
         rotation: predicted rotation of the object, in radians.
         place: (row, col) predicted for the object's point under the pick.
         resolution: the side of a pixel, in metres.
-        pairs: the result of `match`. If it pairs the object with the predicted recess, the fit of
-            this pair is used where it is better than the fit that starts at the prediction.
+        pairs: the result of `match`. If a pair has this object and the predicted recess, the better
+            of two fits is used: that of the pair, or the one that starts at the prediction.
     """
     taken = nearest_region(segmentation.objects, pick)
     if taken is None:

@@ -34,7 +34,7 @@ _LEAST_LAYER = 12
 _REACH = 0.030
 """The largest distance, in metres, by which an object extends beyond its topmost layer."""
 _ROOMS = (0.030, 0.015, 0.008)
-"""Clearances around an object at its free place, in metres, in the order in which they are
+"""Clearances around an object that is laid on the table, in metres, in the order in which they are
 tried."""
 _TURNS = 12
 """The number of rotations that are tried for an object that is laid down."""
@@ -162,8 +162,8 @@ def _layers(segmentation: Segmentation, region: Region) -> list[Region]:
 def _free_pose(
     segmentation: Segmentation, region: Region, layer: Region, pick: Array, resolution: float
 ) -> tuple[Array, float] | None:
-    """Finds the nearest pose on the table at which an object has as much room as possible
-    (`_ROOMS`).
+    """Finds the nearest pose on the table at which an object has the largest possible clearance
+    of `_ROOMS`.
 
     Returns:
         The place (row, col) of the gripped point and the object's rotation in radians; None if

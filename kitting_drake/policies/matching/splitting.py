@@ -49,8 +49,8 @@ _SHARED = 0.45
 _COST = 0.0010
 """The largest mean distance, in metres, of an outline's shared points from the region's outline."""
 _UNEXPLAINED = 0.15
-"""If the objects found in a region leave more than this share of its area uncovered, each of them
-must agree clearly (`_CLEARLY`) with the region's outline."""
+"""If the objects found in a region leave more than this share of its area uncovered, they must all
+agree clearly with the region's outline (`_CLEARLY`)."""
 _CLEARLY = 0.65
 """An object's outline agrees clearly with the region's outline if at least this share of the
 object's outline is shared."""

@@ -26,8 +26,9 @@ def preferred_type() -> torch.dtype:
     """Returns the type to compute in: bfloat16 if the preferred device is faster in it, otherwise
     float32.
 
-    Convolutions in bfloat16 take a fifth of the time with AMX. With AVX-512 alone they take between
-    0.5 and 1.5 times as long, depending on the CPU, so one convolution is timed in each process.
+    With AMX, convolutions in bfloat16 take a fifth of the time of float32. With AVX-512 alone they
+    take 0.5 to 1.5 times as long as in float32, depending on the CPU. So each process times one
+    convolution in both types.
     """
     if preferred_device().type == "cuda":
         # Below compute capability 8 bfloat16 is emulated and slower.

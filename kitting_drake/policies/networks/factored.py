@@ -211,7 +211,7 @@ class Networks(nn.Module):
         Args:
             sample: the training sample.
             pixels: the centres of the crops, near the pick and each of the other picks.
-            random: the random generator of all further draws.
+            random: the generator of all random draws.
         """
         raise NotImplementedError
 

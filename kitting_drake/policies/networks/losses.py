@@ -79,8 +79,8 @@ def log_odds(logits: Tensor, orientations: int = 1) -> Tensor:
     Args:
         logits: the logits of all actions, (rows, cols), or (orientations, rows, cols) if they are
             predicted jointly.
-        orientations: the number of orientations that `logits` stand for. The odds are divided by
-            this number.
+        orientations: the number of possible orientations if `logits` are joint, else 1. The odds
+            are divided by it, so that untrained networks predict even odds.
     """
     return logits.flatten().logsumexp(0) - math.log(orientations) - NOTHING_LOGIT
 

@@ -1,8 +1,8 @@
 """The Transporter, the second baseline of the paper (section V-C.3): ordinary convolutions.
 
 Its networks are not equivariant to rotations, so they get rotated images. For picking, the scene is
-rotated N / 2 times (a parallel jaw is symmetric), and f_pick predicts for each rotated scene where
-a gripper at angle zero would pick. For placing, as in the original (Zeng et al.), the crop is
+rotated N / 2 times, because a parallel jaw is symmetric. In each rotated scene f_pick predicts
+where a gripper at angle zero would pick. For placing, as in the original (Zeng et al.), the crop is
 rotated N times and psi encodes each rotated crop. The equivariant methods encode the crop once.
 """
 
@@ -176,9 +176,9 @@ class TransporterNetworks(Networks):
     ) -> PlacePrediction:
         """Predicts f_place over all pixels and, for N up to 36, at all rotations.
 
-        For larger N, 36 nearly evenly spaced rotations are evaluated first. Then, around each of
-        the three best peaks, all bins from the previous to the next of the 36 rotations are
-        evaluated at the pixels near the peak.
+        For larger N, 36 nearly evenly spaced rotations are evaluated first. The three best peaks
+        are then refined: at the pixels near a peak, all bins between the two neighbouring ones of
+        the 36 rotations are evaluated.
         """
         shape = (image.shape[1], image.shape[2])
         step = math.tau / orientations

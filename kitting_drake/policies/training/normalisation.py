@@ -37,5 +37,5 @@ def _mean_and_std(moments: NDArray[np.float64]) -> tuple[float, float]:
     """
     mean, square = moments.mean(axis=1)
     variance = float(square) - float(mean) ** 2
-    # For constant values the difference is a rounding error.
+    # For constant values rounding errors may give a tiny or negative variance.
     return float(mean), math.sqrt(variance) if variance > 1e-12 else 0.0

@@ -109,8 +109,8 @@ def validate(
     Returns:
         - `median_...` and `p95_...` for each of `ERRORS`: its median and 95th percentile;
         - `displacement_mm`: the mean displacement;
-        - `cost_mm`: the mean displacement over all scenes and final observations, where a wrong
-          decision to stop or to go on counts as 20 mm, and a right decision to stop as 0.
+        - `cost_mm`: the mean displacement over all scenes and final observations. A wrong decision
+          to stop or to go on counts as 20 mm, and a right decision to stop as 0.
 
         If there are final observations, also:
 

@@ -50,8 +50,8 @@ _RECESS_SEEN = 0.3
 _GAP = 1.5
 """Half the largest width, in pixels, of the gap between an object and its recess."""
 _LEAST_GAP = 0.003
-"""Half the largest width, in metres, of the gap between an object and its recess, where this is
-more than `_GAP` pixels."""
+"""Half the largest width, in metres, of the gap between an object and its recess. The larger of
+`_GAP` and `_LEAST_GAP` applies."""
 _FLAT = 0.0006
 """The largest deviation, in metres, from a flat floor's median depth. Twice the noise is used
 instead if that is more."""
@@ -113,9 +113,8 @@ class Segmentation:
     def free_recesses(self) -> tuple[Region, ...]:
         """The recesses that contain no object.
 
-        They are wide, are seen, and have a flat floor. In a filled recess, only the narrow gaps
-        around the object are deep, or the object's surface is not flat, or most of this surface
-        lies just below the fixture's top.
+        They are wide, are seen, and have a flat floor. A filled recess shows narrow gaps around the
+        object, or a surface that is not flat, or one that is mostly just below the fixture's top.
         """
         return tuple(
             item

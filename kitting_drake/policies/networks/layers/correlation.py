@@ -1,9 +1,9 @@
 """Lifting and cross-correlation: the placing module's last step (equations 7 and 8 of the paper).
 
 `cross_correlation` computes the full correlation. `search` finds the largest values without
-computing all of them. It computes a coarse volume by FFT, at half the resolution and a fixed number
-of rotations, and evaluates the full correlation only around the coarse volume's best cells. Its
-cost barely grows with the number of orientations N.
+computing all of them. First it computes a coarse volume by FFT, at half the resolution and a fixed
+number of rotations. Then it evaluates the full correlation only around the coarse volume's best
+cells. Its cost barely grows with the number of orientations N.
 """
 
 from __future__ import annotations

@@ -274,7 +274,9 @@ def frequencies_cutoff(in_fibre: Fibre, out_fibre: Fibre, size: int) -> float | 
     missing = max(out_fibre.frequencies) - max(in_fibre.frequencies)
     radius = size // 2
     if missing > 0 and not radius:
-        raise ValueError("a kernel of one pixel cannot raise the frequency: use a larger kernel")
+        raise ValueError(
+            "a kernel of one pixel cannot map to higher frequencies: use a larger kernel"
+        )
     return missing / radius if missing > radius else None
 
 
