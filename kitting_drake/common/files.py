@@ -119,7 +119,7 @@ def claim_folder(folder: Path, name: str, described: Any, *, of: str) -> None:
 
 
 def _first_difference(found: Any, described: Any) -> str:
-    """Describes the first difference of two descriptions; empty if the text would be long."""
+    """Describes the first difference of two descriptions; empty if they are not mappings."""
     if not isinstance(found, dict) or not isinstance(described, dict):
         return ""
     for key in (*described, *found):

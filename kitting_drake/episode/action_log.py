@@ -120,7 +120,7 @@ class ActionLog:
         best = [gripper_pose(X_WB, grasp) for grasp in scene_object.grasps]
         if best:
             nearest = min(best, key=lambda pose: math.hypot(pick.x - pose.x, pick.y - pose.y))
-            # Several grasps may be at the nearest point. Use the one whose angle is nearest.
+            # Several grasps may be at the nearest point. Use the one nearest in angle to the pick.
             here = [p for p in best if math.hypot(p.x - nearest.x, p.y - nearest.y) < 1e-6]
             angle = min(abs(wrap_to_pi(2 * (pick.theta - p.theta))) / 2 for p in here)
             distance = math.hypot(pick.x - nearest.x, pick.y - nearest.y)

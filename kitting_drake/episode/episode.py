@@ -72,7 +72,7 @@ class EpisodeResult:
     sim_seconds: float
     wall_seconds: float
     point_contact_pairs: int
-    """The largest number of pairs in point contact at any mode change."""
+    """The largest number of point contacts (in place of hydroelastic ones) at any mode change."""
     moving_at_end: list[str]
     """The objects that had not come to rest at the end."""
     failure: str | None
@@ -112,8 +112,7 @@ def run_episode(
 
     Args:
         diagram: the outermost Diagram, with the station and a connected policy.
-        station: a new station from `build_station`. Its scenario sets the time limit, among other
-            things.
+        station: a new station from `build_station`. Its scenario sets the time limit.
         scenario: name of the scenario, for the result.
         policy: name of the policy, for the result.
         realtime_rate: 1 for real time, 0 for as fast as possible.

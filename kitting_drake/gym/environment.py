@@ -226,7 +226,7 @@ class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         return arrays
 
     def _images(self, camera: str) -> dict[str, NDArray[Any]]:
-        """Returns the images from which o_t was projected, with the scenario's noise."""
+        """Returns a camera's images from which o_t was projected, with the scenario's noise."""
         colour, depth = (self._eval(f"{kind}_image_{camera}").data for kind in ("color", "depth"))
         return {"colour": np.array(colour[:, :, :3]), "depth": np.array(depth[:, :, 0])}
 

@@ -128,7 +128,7 @@ class Draft:
     stages: tuple[Stage, ...]
     """The stages that have been applied so far."""
     logits: Tensor
-    """(rows, cols): the logits of the pick, -inf where it is excluded."""
+    """(rows, cols): the logits of the pick, -inf at pixels that must not be picked."""
     pixel: tuple[int, int]
     """(row, col) of the largest logit. The networks' crops are centred on it."""
     angles: AnglePrediction
@@ -180,8 +180,8 @@ class Draft:
         return best_placement(candidate, self.look.orientations, self.continuous)
 
     def among(self, mask: Mask) -> Draft | None:
-        """Returns the best pick within a mask (rows, cols), refined by the same stages; None if the
-        mask leaves no pixel to pick."""
+        """Returns the best pick within a mask (rows, cols), refined by `stages`; None if the mask
+        leaves no pixel to pick."""
         left = _without(self.logits, ~mask)
         if not bool((left > _NEVER).any()):
             return None

@@ -183,7 +183,7 @@ class ReleaseRoom:
                 look.image[3], look.resolution, pixel, draft.theta, *placement, self.planner
             )
 
-        # Candidates are in order of their scores, and `min` returns the first of equals.
+        # Of equally blocked rotations `min` returns the first, which has the highest score.
         rotation, goal = min(as_good, key=blocked)
         return dataclasses.replace(draft, rotation=rotation, goal=goal)
 
@@ -256,8 +256,8 @@ class OutlineStop:
 
 @dataclass(frozen=True)
 class SeenOnly:
-    """Picks and places only where enough of o_t is seen (see `Visibility`). Stops if there is no
-    such action."""
+    """Picks and places only where enough of o_t is seen (see `Visibility`). Stops if no action
+    qualifies."""
 
     planner: PickPlaceParameters
     outlines: bool = True

@@ -60,8 +60,8 @@ class LabelledImage:
     motion: Motion | None = None
     """The motion that augmented the image; None without augmentation."""
     curvatures: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2)))
-    """(1 + n, 2): a curvature for the object of each pick (see `curved_crop`); empty if there is
-    none."""
+    """(1 + n, 2): a curvature for the object of each pick (see `curved_crop`); empty without
+    curvature augmentation."""
 
     @classmethod
     def from_action(cls, image: Image, action: PickPlaceAction, grid: PixelGrid) -> LabelledImage:
@@ -122,7 +122,7 @@ def make_action(
     """Converts a prediction in pixels to an action in the world; the inverse of
     `LabelledImage.from_action`.
 
-    The planner reads the heights from the observation.
+    The action has no surface heights, so the planner reads them from the observation.
 
     Args:
         observation: the heightmap o_t.

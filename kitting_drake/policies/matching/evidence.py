@@ -27,8 +27,8 @@ _REGION_FACTS = (
     *("is_object", "object_seen", "depth", "hole", "size", "apart"),
     *("over_recess", "cost", "reverse", "spread", "rival", "offset", "too_high", "recess_seen"),
 )
-"""Without an object under the pick all of these facts are zero; without a recess under the place
-those of the second row."""
+"""All of these facts are zero if no object is under the pick. Those of the second row are also zero
+if no recess is under the place."""
 _FAR = 20.0
 """Upper limit of the distance from other objects, in mm."""
 _WORST_FIT = 0.002

@@ -17,7 +17,7 @@ _THERE = 0.015
 """An object within this distance of an earlier pick or place, in metres, counts as the object that
 was picked or placed there."""
 _MOST_TRIES = 3
-"""An object is tried at most this many times."""
+"""The largest number of actions on one object."""
 _LEAST_SHARE = 0.5
 """A region smaller than this share of the smallest open recess's area contains no object for an
 open recess."""

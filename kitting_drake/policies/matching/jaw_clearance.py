@@ -39,9 +39,10 @@ _NARROWEST = 0.003
 """The least width of a grasp, in metres."""
 _LOWEST = 0.003
 """The least clearance, in metres, of the fingertips above the object's support, and of the palm
-above everything."""
+above everything under it."""
 _FINGER_MARGIN = 0.003
-"""The clearance kept outside the fingers of the open jaws, in metres."""
+"""An obstacle outside the open fingers blocks a grasp if it is closer to them than this, in
+metres."""
 _STRAIGHT = 0.003
 """A part of the object's face that is recessed by less than this, in metres, touches the pad."""
 

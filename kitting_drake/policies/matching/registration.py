@@ -323,8 +323,8 @@ def _coarse_starts(outline: Outline, recess: Outline) -> list[tuple[float, Array
     lowest = (costs <= np.roll(costs, 1)) & (costs < np.roll(costs, -1))
     candidates = np.flatnonzero(lowest)
     if not len(candidates):
-        # The centroid of an L-shaped recess may lie so far outside the recess that a small object
-        # placed there does not overlap the recess.
+        # All costs are equal if the object does not overlap the recess, for example a small object
+        # at the centroid of an L-shaped recess.
         candidates = np.array([costs.argmin()])
     best = candidates[np.argsort(costs[candidates])][:_STARTS]
     return [

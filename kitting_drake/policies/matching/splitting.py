@@ -33,12 +33,13 @@ _ANGLES = 72
 _STARTS = 5
 """The number of initial poses that are refined for each recess."""
 _OUTSIDE = 3.0
-"""In the search for poses, the penalty of a covered pixel outside the region. A covered pixel of
-the region scores 1."""
+"""In the search for poses, the penalty of each pixel of the recess that lies outside the region. A
+pixel inside the region scores 1."""
 _NOTCH = 0.3
-"""In the search for poses, the score of a covered pixel in a narrow notch of the region."""
+"""In the search for poses, the score of each pixel of the recess that lies in a narrow notch of the
+region."""
 _RIM = 1.5
-"""In the search for poses, the score of an outline that coincides with the region's outline."""
+"""In the search for poses, the score of a recess whose outline coincides with the region's."""
 _INSIDE = 0.94
 """The least share of a recess's area that must lie within the region."""
 _NEAR = 0.0025
@@ -67,7 +68,8 @@ _SLIVER = 1
 """What remains of a region after objects are cut out is eroded by this many pixels, to drop
 slivers."""
 _LEAST_REST = 0.0002
-"""What remains of a region is an object if its area is at least this, in square metres."""
+"""What remains of a region after objects are cut out is an object if its area is at least this, in
+square metres."""
 
 
 @dataclass(frozen=True)

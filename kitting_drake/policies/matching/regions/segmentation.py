@@ -165,9 +165,9 @@ class Segmentation:
     def _is_fragment(self, recess: Region) -> bool:
         """Whether a region is only a fragment of a filled recess.
 
-        If it is, the rest of the recess shows the object's top, slightly below the fixture's top,
-        and is larger than the fragment. In a free recess, only narrow slots whose floor no camera
-        sees look so shallow, and these are smaller than the region.
+        The rest of a filled recess shows the object's top, slightly below the fixture's top, and is
+        larger than the fragment. In a free recess only narrow slots look so shallow, because no
+        camera sees their floor. They are smaller than the region.
         """
         if self.noise > CLEAN:
             return False

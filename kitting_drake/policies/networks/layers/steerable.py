@@ -114,6 +114,7 @@ class SteerableConv2d(ExpandedConv2d):
         kind = torch.get_default_dtype()
         basis, squares = _shared_basis(self.in_fibre, self.out_fibre, size, kind)
         # The samples of a field are correlated, because they are computed from fewer coefficients.
+        # Their weighted sums therefore vary more.
         repeated = self.in_fibre.channels / self.in_fibre.size
         gathered = in_fields * squares * repeated / self.out_fibre.channels
         return basis, len(basis), math.sqrt(2 / gathered)
