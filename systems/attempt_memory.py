@@ -66,14 +66,15 @@ class AttemptMemory:
         return values[1:].reshape(len(self._objects), self._most)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
-        if not self._mode.HasValue(context) or not self._accepted.HasValue(context):
+        if not self._mode.HasValue(context):
             return EventStatus.DidNothing()
         mode = self._mode.Eval(context)[0]
         state = discrete_state.get_mutable_value(self._index)
         if mode == state[0]:
             return EventStatus.DidNothing()
         state[0] = mode
-        if mode != Mode.APPROACH:
+        # `HasValue` evaluates the port, so call it only when the action is needed.
+        if mode != Mode.APPROACH or not self._accepted.HasValue(context):
             return EventStatus.Succeeded()
         action = self._accepted.Eval(context)
         if not action.press:

@@ -117,11 +117,8 @@ class ContactGuard:
             vertical = f_z - min(max(f_z, -mass * pull), 0.0)
         side_x, side_y = f_x + mass * a_x, f_y + mass * a_y
         lateral = math.hypot(side_x, side_y)
-        state.recent[3:] = state.recent[:-3].copy()
-        state.recent[:3] = side_x, side_y, vertical
-        total = np.add.reduce(state.recent[: 3 * self._samples].reshape(-1, 3)).tolist()
-        mean = [component / self._samples for component in total]
-        self._keep_peaks(state, abs(mean[2]), math.hypot(*mean[:2]))
+        mean_x, mean_y, mean_z = self._mean(state, (side_x, side_y, vertical))
+        self._keep_peaks(state, abs(mean_z), math.hypot(mean_x, mean_y))
         push = max(-vertical, 0.0) if mode in _RISES else abs(vertical)
         if mode == Mode.DESCEND and state.press:
             push = 0.0
@@ -144,6 +141,17 @@ class ContactGuard:
         felt, weighed = float(contact[2]), float(state.payload)
         if not state.weighings or abs(felt - weighed) < threshold / 2 - 0.1 * weighed:
             state.payload = min(felt, 0.0)
+
+    def _mean(self, state: PlannerState, latest: tuple[float, ...]) -> list[float]:
+        """Adds the latest force to `recent`. Returns the mean (3) of the latest samples, in N."""
+        # Use plain floats: this runs at every step, and NumPy is slower for so few elements.
+        recent = state.recent
+        kept = [*latest, *recent[: 3 * self._samples - 3].tolist()]
+        recent[: len(kept)] = kept
+        mean = [0.0, 0.0, 0.0]
+        for index, component in enumerate(kept):
+            mean[index % 3] += component / self._samples
+        return mean
 
     def _weigh(self, state: PlannerState, apparent: float, height: float) -> None:
         if height >= state.travel_z - _CLEAR:

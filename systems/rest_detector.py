@@ -47,12 +47,13 @@ class _Boxes:
         centres = np.einsum("...ij,...j->...i", X[..., :3], self.poses[:, :, 3]) + X[..., 3]
         return rotations, centres, self.halves
 
-    def enclosing(self) -> Box:
-        """The box around all boxes, aligned with their common frame."""
+    def enclosing(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Centre (3) and half size (3) of the box around all boxes, aligned with their common
+        frame."""
         reach = np.einsum("kij,kj->ki", np.abs(self.poses[:, :, :3]), self.halves)
         lower = (self.poses[:, :, 3] - reach).min(axis=0)
         upper = (self.poses[:, :, 3] + reach).max(axis=0)
-        return Box(RigidTransform((lower + upper) / 2), (upper - lower) / 2)
+        return (lower + upper) / 2, (upper - lower) / 2
 
 
 def _gaps(
@@ -131,7 +132,10 @@ class RestDetector(LeafSystem):
         bodies = [*objects, *movers]
         self._bodies = [int(item.body) for item in bodies]
         self._pieces = [_Boxes(item.boxes) for item in bodies]
-        self._wholes = _Boxes([pieces.enclosing() for pieces in self._pieces])
+        wholes = [pieces.enclosing() for pieces in self._pieces]
+        # Centres and half sizes, (bodies, 3) each, of a box around each body, in the body's frame.
+        self._centres = np.array([centre for centre, _ in wholes])
+        self._halves = np.array([half_size for _, half_size in wholes])
         self._position_tolerance = position_tolerance
         # A rotation by the angle a differs from the identity by 2 sqrt(2) sin(a / 2) in the
         # Frobenius norm.
@@ -181,16 +185,21 @@ class RestDetector(LeafSystem):
         """
         if not resting.any():
             return
-        rotations, centres, halves = boxes = self._wholes.posed(X)
-        reach = (np.abs(rotations) @ halves[:, :, None])[:, :, 0]
-        lower, upper = centres - reach, centres + reach + self._wake_distance
-        # An awake object wakes its neighbours, which wake theirs. Cheap tests come first: boxes
-        # aligned with the world, then boxes around bodies, then boxes around their pieces.
         waking = np.append(~resting, np.ones(len(self._bodies) - self._count, bool))
+        # Cheap tests come first: boxes aligned with the world, then boxes around bodies, then boxes
+        # around their pieces. Most of the time the first suffices.
+        rotations = X[:, :, :3]
+        centres = np.einsum("bij,bj->bi", rotations, self._centres) + X[:, :, 3]
+        boxes = rotations, centres, self._halves
+        reach = np.einsum("bij,bj->bi", np.abs(rotations), self._halves)
+        apart = np.abs(centres[: self._count, None] - centres) - reach[: self._count, None] - reach
+        close = (apart < self._wake_distance).all(axis=2)
+        if not (close & resting[:, None] & waking).any():
+            return
+        # An awake object wakes its neighbours, which wake theirs.
         while waking.any():
             i, j = np.flatnonzero(resting), np.flatnonzero(waking)
-            near = (lower[i, None] < upper[j]) & (lower[j] < upper[i, None])
-            near = near.all(axis=2)
+            near = close[np.ix_(i, j)]
             waking[:] = False
             if not near.any():
                 break

@@ -314,14 +314,15 @@ class KittingStation(Diagram):
                 "the station is part of a Diagram: pass the outermost Diagram to make_simulator"
             )
         simulator = Simulator(self if diagram is None else diagram)
+        bodies = self._bodies
 
         def step(root_context: Context) -> EventStatus:
             self._let_appear(root_context)
-            self._apply_sleep(root_context)
+            self._apply_sleep(root_context, bodies)
             status = EventStatus.DidNothing() if monitor is None else monitor(root_context)
             # Correct the drift last, so that the monitor sees the bodies where the planner's update
             # saw them.
-            self._correct_drift(root_context)
+            self._correct_drift(root_context, bodies)
             return status
 
         simulator.set_monitor(step)
@@ -330,19 +331,19 @@ class KittingStation(Diagram):
     # The simulator's monitor calls the next three methods, because a LeafSystem cannot change the
     # context of another system.
 
-    def _correct_drift(self, root_context: Context) -> None:
+    def _correct_drift(self, root_context: Context, bodies: Sequence[RigidBody]) -> None:
         """Calls `correct_drift` if the plant has just made a step."""
         step = self.plant.time_step()
         # Allow for rounding errors in the times of steps, which are exact only if the step is a
         # binary fraction.
         if abs(math.remainder(root_context.get_time(), step)) < 1e-6 * step:
             context = self.plant.GetMyMutableContextFromRoot(root_context)
-            correct_drift(self.plant, context, self._bodies)
+            correct_drift(self.plant, context, bodies)
             if self._arm_path is not None:
                 # Do not evaluate the port `robot_state` here: that would keep the Diagram alive
                 # forever.
                 state = robot_state(self.plant, context)
-                self._arm_path.correct(self.plant, context, state, self._bodies)
+                self._arm_path.correct(self.plant, context, state, bodies)
 
     def _let_appear(self, root_context: Context) -> None:
         """Moves an object that is to appear now to its place on the table."""
@@ -357,7 +358,7 @@ class KittingStation(Diagram):
         plant_context = self.plant.GetMyMutableContextFromRoot(root_context)
         self.plant.SetFreeBodyPose(plant_context, body, self.scene.arrivals.poses[index])
 
-    def _apply_sleep(self, root_context: Context) -> None:
+    def _apply_sleep(self, root_context: Context, bodies: Sequence[RigidBody]) -> None:
         """Freezes objects at rest and thaws the others.
 
         A frozen object's joint is locked. Its contact with table, fixtures and other frozen objects
@@ -371,10 +372,9 @@ class KittingStation(Diagram):
             positions = [X_WB.translation() for X_WB in self.object_poses(root_context)]
             may_sleep = may_sleep & (np.linalg.norm(positions, axis=1) > GONE)
         plant_context = self.plant.GetMyMutableContextFromRoot(root_context)
-        bodies, at_rest = self._bodies, may_sleep.tolist()
         changed = [
             (body, resting)
-            for body, resting in zip(bodies, at_rest, strict=True)
+            for body, resting in zip(bodies, may_sleep.tolist(), strict=True)
             if resting != body.is_locked(plant_context)
         ]
         if not changed:

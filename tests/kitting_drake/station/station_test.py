@@ -253,7 +253,7 @@ def test_a_sleeping_stack_has_no_contacts_until_it_wakes(monkeypatch: pytest.Mon
     at_rest = rig.station.at_rest(root)
     at_rest[top] = False
     monkeypatch.setattr(rig.station, "at_rest", lambda _: at_rest)
-    rig.station._apply_sleep(root)
+    rig.station._apply_sleep(root, rig.station._bodies)
     assert locked(rig, root) == [True] * top + [False]
     Simulator(rig.diagram, root).AdvanceTo(root.get_time() + 0.01)
     assert 0 < contacts(root) < max(counts)
