@@ -27,7 +27,7 @@ def draw_heights(heights: Mapping[str, NDArray[np.float32]], grid: PixelGrid) ->
         The picture as PNG.
     """
     values = np.concatenate([item[np.isfinite(item)] for item in heights.values()])
-    # Ignore objects on the table.
+    # Leave out objects, so that the colour scale shows small errors of the table's height.
     flat = np.abs(values[np.abs(values) < 0.02])
     reach = max(1.0, 1e3 * float(np.percentile(flat, 98))) if flat.size else 1.0
     down = (len(heights) + 1) // 2

@@ -23,7 +23,7 @@ _JAWS = 0.04
 """Half the opening of the jaws in the drawing, in metres."""
 _PICK, _PLACE = "#e4572e", "#1b998b"
 _UNSEEN, _STRIPE = (0.80, 0.72, 0.86), (0.68, 0.57, 0.78)
-"""Colours of the stripes that mark pixels in a camera's view without a measured depth."""
+"""Colours of the stripes on pixels that a camera sees, but for which it measured no depth."""
 _OUTSIDE = (0.90, 0.90, 0.90)
 """Colour of pixels outside all cameras' views or outside the region of interest."""
 _STRIPES = 6

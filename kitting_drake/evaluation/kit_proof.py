@@ -66,7 +66,7 @@ class ToolProof:
     tried: int = 0
     peak_force_n: float = 0.0
     causes: Counter[str] = field(default_factory=Counter)
-    """How often the tool failed for each cause, in the words of `results.json`."""
+    """The number of failures by cause; the causes are named as in `results.json`."""
 
     def as_dict(self) -> dict[str, Any]:
         """Returns the results as plain values for JSON."""
@@ -155,7 +155,7 @@ def prove_kit(
     The policy is that of the kit's scenario. In each episode the tools lie at other poses, and
     all cavities are wider or narrower by a common random error with the standard deviation
     `TOLERANCE_MM`. A kit that does not fit is tried again with wider cavities, if these may mend
-    its failures. If a clearance certainly does not fit, its remaining episodes are left out.
+    its failures. A clearance at which the kit certainly does not fit gets no further episodes.
 
     Args:
         folder: a folder that `hkd kit` wrote.
@@ -187,7 +187,7 @@ def prove_kit(
             if wider[-1].fits:
                 break
     verdict = _verdict(proof, wider)
-    # Record the names before the files are written, so that a later `hkd kit` may replace them.
+    # Record the files before writing them: `hkd kit` replaces only recorded files.
     record["files"] = sorted({*record["files"], *_FILES})
     write_json(folder / "kit.json", record)
     write_json(

@@ -160,8 +160,10 @@ def peak_forces(episodes: Sequence[Episode]) -> list[Entry]:
 
 
 def needless_actions(episode: Episode) -> int:
-    """The number of actions on objects for which no goal was left. Success rates do not count them,
-    but they may do harm."""
+    """The number of actions on objects for which no goal was left.
+
+    Success rates do not count these objects, but moving them may disturb other objects.
+    """
     useful = {item["name"] for item in episode["objects"] if item["add_s_mm"] is not None}
     if not useful:
         # The result of a failed episode may have no objects.
@@ -325,8 +327,8 @@ def find_ambiguities(item: Mapping[str, Any]) -> list[str]:
 
 
 def _describe(items: list[Entry], key: str) -> dict[str, float | None]:
-    """Returns the median, the 95th percentile and the maximum of the magnitudes of a value. Items
-    whose value is None are left out."""
+    """Returns the median, the 95th percentile and the maximum of the magnitudes of the items'
+    values under a key. Values that are None are left out."""
     values = [abs(item[key]) for item in items if item[key] is not None]
     if not values:
         return {"median": None, "p95": None, "max": None}

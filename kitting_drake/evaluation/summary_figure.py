@@ -68,9 +68,9 @@ def draw_summary(summary: dict[str, Any], episodes: Sequence[Episode], path: Pat
 
     Three panels show, for each category, the share of objects with an error of at most x. The
     errors are ADD-S (with the task's threshold, if any), position and angle. The panels of position
-    and angle also show the errors of the policy's actions, which do not include slip. Objects of
-    failed or timed-out episodes count as infinite errors. The fourth panel counts the causes of
-    failure.
+    and angle also show the errors of the policy's actions; these do not include slip in the jaws.
+    Objects of failed or timed-out episodes count as infinite errors. The fourth panel counts the
+    causes of failure.
 
     Args:
         summary: the result of `summarise`.

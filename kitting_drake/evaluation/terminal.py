@@ -92,8 +92,8 @@ def print_episode(console: Console, result: EpisodeResult) -> None:
 
 
 def _ending(result: EpisodeResult) -> str:
-    """A line that says why the episode ended, what is left over, and how large the contact force
-    was."""
+    """A line with the reason why the episode ended, the objects and goals left over, and the
+    largest contact force."""
     verdict = " (wrong)" if result.stop_reason_right is False else ""
     left = result.left_over.text or "nothing"
     line = f"stopped: {result.stop_reason}{verdict}; left over: {left}"

@@ -193,7 +193,7 @@ def read_calibration(
         beside: tuple[str, ...] = ()
         entries = with_chained_poses(entries, path)
     else:
-        # A file of another tool may describe a whole camera.
+        # The file may be one camera's intrinsics in the layout of another tool.
         content = lens_of_mapping(content, str(path))
         entries = {str(content.get("camera_name", "camera")): content}
         # A file with one camera mixes the camera's fields with those that all cameras share.

@@ -78,8 +78,8 @@ def _load_matrix(path: Path) -> Array:
 
 
 def _plain_numbers(text: str) -> list[str] | None:
-    """Returns the numbers in a text that holds nothing else, as np.savetxt writes it; None if it
-    holds other words."""
+    """Returns the numbers in a text, as np.savetxt writes them; None if the text has other
+    words."""
     words = re.sub(r"#[^\n]*", "", text).replace(",", " ").replace(";", " ").split()
     try:
         return words if [float(word) for word in words] else None
@@ -156,8 +156,8 @@ def open3d_pose(content: dict[str, Any], where: str) -> Array:
 
 
 def _easy_handeye(content: dict[str, Any], where: str) -> FoundPose:
-    """Reads the pose in a file of easy_handeye for ROS 1, whose older versions have no
-    `parameters`."""
+    """Reads the pose in a file of easy_handeye for ROS 1. Files of its older versions have no
+    field `parameters`."""
     inner = content.get("parameters", content)
     if not isinstance(inner, dict) or not isinstance(inner.get("eye_on_hand"), bool):
         raise UserError(f"{where} lacks eye_on_hand: give true or false")

@@ -99,8 +99,8 @@ def _pose(words: Sequence[str], where: str) -> FoundPose:
     words = [word for word in words if ":=" not in word]
     if any(word.startswith("--") for word in words):
         return _pose_of_flags(words, where)
-    # The older layout has x y z yaw pitch roll, or x y z qx qy qz qw; then both frames, and a
-    # period.
+    # Without flags, the arguments are x y z yaw pitch roll, or x y z qx qy qz qw; then the
+    # parent and the child frame, and in ROS 1 a period.
     values: list[float] = []
     while len(values) < len(words) and _is_number(words[len(values)]):
         values.append(float(words[len(values)]))

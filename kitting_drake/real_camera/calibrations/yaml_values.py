@@ -85,7 +85,7 @@ def parse_yaml(text: str, path: Path) -> dict[str, Any]:
         problem = getattr(error, "problem", None) or "it is not YAML"
         raise UserError(f"{path}:{where} {problem}") from error
     except (ValueError, KeyError, AttributeError) as error:
-        # Such errors come from text that resembles a date, or a tag that does not fit its value.
+        # PyYAML raises these for text that resembles a date, or a tag that does not fit its value.
         reason = str(error) if isinstance(error, ValueError) else "a tag does not fit its value"
         raise UserError(f"{path} is not YAML: {reason}") from error
     except RecursionError as error:
@@ -102,7 +102,7 @@ def number(value: Any, where: str) -> float:
         UserError: the value is something else. The message names the field.
     """
     try:
-        # YAML 1.1 reads 4e2 as text.
+        # Convert text as well, because YAML 1.1 reads 4e2 as text.
         result = float(value) if not isinstance(value, bool) else math.nan
     except (TypeError, ValueError, OverflowError):
         result = math.nan

@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 
 _LEAST_POINTS = 500
 _SHARED = 100
-"""The least number of pixels of o_t that two cameras must share to be compared."""
+"""Two cameras are compared if both see at least this number of pixels of o_t."""
 
 
 @dataclass(frozen=True)

@@ -50,7 +50,7 @@ class SeenBlock:
     middle: Array
     """The position (2,) of the block's centre in the base frame, in metres."""
     yaw: float
-    """The direction of the length about z, in radians, modulo `Block.period`."""
+    """The yaw of the block's length in the base frame, in radians, modulo `Block.period`."""
     size: tuple[float, float, float]
     """The length, width and height, in metres."""
     corner: float

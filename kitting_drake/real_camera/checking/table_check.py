@@ -46,8 +46,8 @@ _ABOVE = 0.08
 """The plane at the calibrated height counts as the table only if it has at least this share of the
 pixels of any plane above it. The share is small, because objects may hide most of a table."""
 _CURVED = 0.5
-"""The depths are probably distances from the camera if their conversion to depths along the optical
-axis reduces the table's noise to less than this fraction of its value."""
+"""The depths are converted as if they were distances from the camera. If this reduces the table's
+noise to less than this fraction, they probably are distances."""
 _FLAT = 0.0005
 """The noise below which a table counts as flat, in metres."""
 

@@ -68,7 +68,7 @@ _LEAST_TALL = 0.02
 _AROUND = 0.02
 """The width of a margin around tall things, in metres. The margin is ignored as well."""
 _TOO_NEAR = 0.25
-"""The distance from the middle of an arm's base within which it cannot pick, in metres."""
+"""An arm cannot pick within this distance of the middle of its base, in metres."""
 _ENOUGH = 0.6
 """A workspace farther from the base than `_TOO_NEAR` is preferred if it holds more than this share
 of the largest table area that a workspace can hold."""
@@ -262,7 +262,14 @@ def _best_centre(table: Mask, grid: PixelGrid, size: Array, centre: Array, fits:
 
     The best window is the nearest to the base among those with nearly the largest table area. A
     window too near the base is chosen only if all others have much less table area. Along an
-    axis on which the whole table fits, the window's centre is `centre`.
+    axis along which the whole table fits into the window, `centre` is kept.
+
+    Args:
+        table: (rows, cols) the table.
+        grid: the cells of the mask.
+        size: (2,) the size of the window, in metres.
+        centre: (2,) the centre of the table, in metres.
+        fits: (2,) for each axis, whether the whole table fits into the window.
     """
     window = np.rint(size / _CELL).astype(int)
     sums = np.pad(table.astype(np.int64).cumsum(0).cumsum(1), ((1, 0), (1, 0)))

@@ -87,7 +87,7 @@ def read_depth(path: Path, depth_scale: float) -> NDArray[np.float32]:
 
 
 def read_npz(path: Path, depth_scale: float) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """Reads colour and depth from an archive with arrays of these names.
+    """Reads an archive with the arrays `color` (or `colour`, or `rgb`) and `depth`.
 
     Raises:
         UserError: an array is missing, damaged, or of a wrong type.

@@ -23,8 +23,8 @@ from kitting_drake.real_camera.markers.board_poses import BoardFit, fit_board
 from kitting_drake.real_camera.markers.boards import Board, SeenBoard, find_corners
 
 _MOVED = 0.5
-"""The largest difference, in pixels, between the error of one pose for all images and the error of
-a pose for each image. If it is larger, the board or the camera moved."""
+"""The largest difference, in pixels, between two errors of the corners: that of one pose for all
+images, and that of separate poses. If it is larger, the board or the camera moved."""
 
 
 @dataclass(frozen=True)

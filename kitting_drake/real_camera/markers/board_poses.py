@@ -26,11 +26,11 @@ _SAME = math.radians(1)
 """The angle in radians below which two poses count as the same."""
 _CLEARER = 16.0
 """A pose is ambiguous if another pose raises the sum of the corners' squared errors by less than
-this multiple of the variance of one corner."""
+this multiple of the error variance of one corner."""
 _LIKELY = 0.2
 """The least error of corners, in pixels, that is assumed in the test for ambiguous poses."""
 _NOISE = 0.05
-"""The least error of corners, in pixels, that is assumed for the error of the focal ratio."""
+"""The least error of corners, in pixels, that is assumed in computing `BoardFit.focal_error`."""
 _WORST = 3.0
 """The error of corners, in pixels, above which the lens is probably another one, or the board
 moved."""
@@ -85,7 +85,7 @@ def fit_board(points: Array, pixels: Array, lens: Intrinsics, where: str) -> Boa
                 "it more from the side"
             )
     middle = X[:3, :3] @ points.mean(axis=0) + X[:3, 3]
-    # The board's z points up, and the line of sight points down.
+    # Change the sign, because the board's z points up and the line of sight points down.
     cosine = -(middle @ X[:3, 2]) / np.linalg.norm(middle)
     angle = float(np.arccos(np.clip(cosine, -1, 1)))
     if angle > _STEEPEST:

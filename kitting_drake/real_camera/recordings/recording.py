@@ -77,7 +77,7 @@ def open_recording(path: Path) -> Iterator[Recording]:
     except UserError:
         raise
     except Exception as error:
-        # For damaged files, the libraries raise exceptions of a dozen other libraries.
+        # A damaged file may raise an exception of any of a dozen libraries.
         told = str(error).partition("\n")[0].strip("= ") or type(error).__name__
         raise UserError(f"the recording {path} is damaged or not complete: {told}") from error
 

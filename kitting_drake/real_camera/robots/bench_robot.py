@@ -35,8 +35,8 @@ class BenchRobot:
     """The pose of the arm's base in the calibration's base frame."""
     home: tuple[float, float, float, float] | None = None
     """Where the hand waits: x, y and height of the fingertips in metres, and yaw in radians. None
-    means `planner.home` of the simulated cell. After an action the hand returns to this x.
-    Along y it stays as near to the place of the action as the arm can reach."""
+    means `planner.home` of the simulated cell. After an action the hand returns to this x, at the
+    y of the place or as near to it as the arm can reach."""
     joints: tuple[float, ...] | None = None
     """The seven joint positions from which the arm starts, in rad; None for those at `home`."""
     rate: int = FASTEST_RATE

@@ -121,7 +121,7 @@ def _search(
     bases = _bases(given, grid)
     places = track(bases, "searching", console=console, transient=True, disable=console.quiet)
     found = [_Best(score(base, coarse), base) for base in places]
-    # Among equally good bases, prefer the farthest one, from which the joints move less.
+    # Among equally good bases, prefer the one farthest from the workspace: its joints move less.
     middle = (grid.x_min + grid.x_max) / 2, (grid.y_min + grid.y_max) / 2
 
     def order(it: _Best) -> tuple[float, float]:

@@ -242,7 +242,7 @@ def _draw_noise(rng: np.random.Generator) -> SensorNoiseParameters:
 
 
 def fit(judged: list[Judged]) -> Reliability:
-    """Fits a logistic regression that predicts from its evidence whether a decision is right.
+    """Fits a logistic regression that predicts, from a decision's evidence, whether it is right.
 
     The threshold is `LEAST_CONFIDENCE`.
     """

@@ -130,7 +130,7 @@ def _start_up_times() -> dict[str, float]:
     """Returns the wall times of short runs from the shell, including Meshcat and files, in s."""
     times = {}
     with tempfile.TemporaryDirectory() as folder:
-        # The first run fills the cache for the second.
+        # Begin with an empty cache, which the first run fills for the second.
         environment = os.environ | {"XDG_CACHE_HOME": folder}
         command = [sys.executable, "-m", "kitting_drake.run", str(_SCENARIO), "--quiet"]
         command += ["--scenario_text", "{time_limit: 0.1}", "--output", folder]

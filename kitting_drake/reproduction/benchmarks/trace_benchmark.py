@@ -56,9 +56,9 @@ def benchmark_trace(
 ) -> dict[str, Any]:
     """Draws three photos of each tool, traces them and measures the outlines, in mm.
 
-    The errors of outlines about which the tracer has no doubts are given separately as well. A
-    tool's sides hide narrow gaps, and its cavity bridges them, so there are also errors without
-    gaps below `GAP_MM`.
+    There are separate errors for the outlines about which the tracer reports no doubts. There are
+    also errors without gaps below `GAP_MM`: in a photo, a tool's sides hide narrow gaps, and its
+    cavity bridges them.
 
     Args:
         names: the names of the tools.

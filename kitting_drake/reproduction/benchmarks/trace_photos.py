@@ -53,7 +53,7 @@ class PhotoSpec:
     tilt: float = 0.0
     """The angle between the line of sight and the vertical, in degrees."""
     azimuth: float = 0.0
-    """The direction toward which the camera is tilted, in degrees."""
+    """The direction from the sheet's middle to the tilted camera, in degrees from x toward y."""
     roll: float = 0.0
     """The rotation about the line of sight, in degrees."""
     ground: str = "dark"
@@ -65,7 +65,8 @@ class PhotoSpec:
     softness: float = 0.15
     """The standard deviation of `light` among the lamps, which makes shadows soft."""
     falloff: float = 0.25
-    """The loss of light from one side of the sheet to the other."""
+    """How uneven the light is: its relative change along a slanted line across the sheet, from the
+    middle to each end."""
     blur: float = 1.0
     """The standard deviation of the blur, in pixels."""
     noise: float = 0.006

@@ -28,7 +28,8 @@ from kitting_drake.reproduction.benchmarks.trace_photos import draw_photo
 from kitting_drake.scenario.choosing import find_scenario
 
 _PHOTOS = 6
-"""The largest number of photos of a tool. A photo whose outline is in doubt is taken again."""
+"""The largest number of photos of a tool. Another photo is taken if the tracer refuses a photo or
+doubts its outline."""
 _TOOLS = 4
 _LINES = "kits.jsonl"
 
@@ -39,8 +40,8 @@ def measure_traced_kits(
     """Makes kits of four tools from traced photos, and lets the oracle fill them with the true
     tools, with one try for each. Skips the kits that are in the folder already.
 
-    The photos are drawn as for `benchmark trace`, with each tool's own height. A photo in doubt is
-    taken again, as `hkd trace` asks.
+    The photos are drawn as for `benchmark trace`, with each tool's own height. If the tracer
+    refuses a photo or doubts its outline, another photo is taken, as `hkd trace` asks.
 
     Args:
         kits: the number of kits.
@@ -75,7 +76,7 @@ def _measure(number: int, seed: int, clearance_mm: float, folder: Path) -> dict[
     names = [name for name, place in traced.items() if place is not None]
     cavities = [str(place.resolve()) for place in traced.values() if place is not None]
     if not names:
-        raise UserError("all photos of a kit's tools are refused or in doubt: take another --seed")
+        raise UserError("the tracer refuses or doubts all photos of a kit: take another --seed")
     export_kit(KitRequest(tuple(cavities), folder / "kit", clearance_mm=clearance_mm))
     task = json.dumps({"tools": names, "cavities": cavities, "tries": 1})
     chosen = find_scenario(
@@ -101,7 +102,8 @@ def _traced(
     """Traces a tool, and appends its photos to `photos`.
 
     Returns:
-        The folder of the traced tool; None if all photos are refused or in doubt.
+        The folder of the traced tool; None if the tracer refuses all photos or doubts their
+        outlines.
     """
     true = load_tool(name)
     for attempt in range(_PHOTOS):

@@ -37,7 +37,7 @@ def measure_folding(setup: SpeedSetup) -> dict[str, Any]:
           a decision;
         - `alpha_difference`: the standard deviation of the difference between alpha's output and
           that of plain escnn, relative to the standard deviation of the latter;
-        - `alpha_operations`: the operations of one inference of alpha.
+        - `alpha_operations`: the number of operations of one inference of alpha.
     """
     ways = _ways(setup)
     exported = {name: pair[1] for name, pair in ways.items()}

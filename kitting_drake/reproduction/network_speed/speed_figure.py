@@ -143,8 +143,8 @@ def _label(
     quantity: str,
     text: Callable[[float], str],
 ) -> None:
-    """Writes the value of a point above it, or below it if it is the lowest of several points at
-    one N."""
+    """Writes a point's value above the point. The lowest of several points at one N has its value
+    below it."""
     there = [other[quantity] for other in rows if other["orientations"] == row["orientations"]]
     below = len(there) > 1 and row[quantity] == min(there)
     axis.annotate(

@@ -12,7 +12,7 @@ def rate_text(rate: float, interval: Sequence[float]) -> str:
 def markdown_table(
     headings: Sequence[str], rows: Sequence[Sequence[str]], left_columns: int = 1
 ) -> str:
-    """Formats a table whose source is aligned, except for the end of a last column of text.
+    """Formats a table with aligned columns. If the last column is text, its cells are not padded.
 
     Args:
         headings: the headings of the columns.
@@ -20,7 +20,7 @@ def markdown_table(
         left_columns: the number of leading columns that are aligned left. The others are aligned
             right.
     """
-    # Make rules of at least three characters, because some readers require it.
+    # Write at least three dashes below a heading, because some Markdown parsers require it.
     widths = [max(3, *map(len, column)) for column in zip(headings, *rows, strict=True)]
     if left_columns == len(headings):
         widths[-1] = 3

@@ -81,7 +81,8 @@ def mean_paired_difference(
 
 
 def points_text(found: Estimate) -> str:
-    """Formats a difference of rates in points, with its interval if any episode differs."""
+    """Formats a difference of rates in percentage points. Adds its interval if any episode
+    differs."""
     if found.low == found.high == 0:
         return "+0.0 (none differs)"
     return f"{100 * found.value:+.1f} ({100 * found.low:+.1f} to {100 * found.high:+.1f})"

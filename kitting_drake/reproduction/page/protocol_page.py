@@ -26,7 +26,8 @@ class _Paper:
     ours: float
     """The success rate of the SO(2) method at N = 180 with 100 demonstrations, in percent."""
     transporter_gain: float
-    """The advantage of the Equivariant Transporter over the SO(2) method, on average, in points."""
+    """The mean of the Equivariant Transporter's rate minus that of the SO(2) method, in percentage
+    points."""
 
 
 PAPER = {

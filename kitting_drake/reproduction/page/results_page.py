@@ -16,7 +16,7 @@ def results_page(
     """Writes the whole page, in Markdown.
 
     Args:
-        runs: the runs that fill no cell, from `cell_results`.
+        runs: the runs that fill no cell of the paper's tables, from `cell_results`.
         link: the path from the page's folder to that of the table of runs.
         fresh: the sections from `kitting_drake.reproduction.paper.paper_sections.fresh_tools`.
         paper: the sections from `kitting_drake.reproduction.paper.paper_sections.paper_sections`.

@@ -25,14 +25,14 @@ _COLUMNS = {
     "shape_matching": "shape matching",
 }
 _COMPARED = ("generalist minus its unperturbed rate", "generalist minus shape matching")
-"""The paired differences, in points, on the seeds that both runs have."""
+"""The paired differences, in percentage points, on the seeds that both runs have."""
 _TRIES = 2
 _FRAMES = 5
 """The number of images per observation in the rows with several frames."""
 _SEEDS = range(2870, 2895)
 """The seeds of every cell of the first table. They were not used before these runs."""
 _FEWEST = 12
-"""Runs at a level other than moderate have at least this many of these seeds, from the first on."""
+"""Runs at other levels than moderate have at least this many of `_SEEDS`, from the first one on."""
 
 Key = tuple[str, str]
 """The label of a row of the table, and a method."""
@@ -42,8 +42,9 @@ def robustness_table(runs: Sequence[Run]) -> str:
     """Writes the tables of strict success on unseen toolsets.
 
     Policies have two tries per tool and may recover. All runs of the first table use the same
-    seeds. The second table has the other levels, on the first of these seeds. The last table has
-    all seeds of the cells that ran on more seeds, because a selection could flatter the policy.
+    seeds. The second table has the levels other than moderate, on the first of these seeds. The
+    last table has the cells that ran on more seeds, with all their seeds, because a selection could
+    flatter the policy.
 
     Args:
         runs: all runs. Runs of other scenarios, and runs with other weights than the shipped ones,
@@ -117,7 +118,7 @@ def _table(found: Mapping[Key, Sequence[Run]], labels: Sequence[str], counted: b
         return f"{text}, {objects}" if counted else text
 
     def outcomes(key: Key) -> dict[str, Any]:
-        # Summaries of older versions have no outcomes.
+        # Leave out summaries of older versions, which have no outcomes.
         return {
             "outcomes": [
                 item for run in found.get(key, ()) for item in run.summary.get("outcomes", ())

@@ -33,8 +33,8 @@ STEADIER = {
 rate of their `reference`: the pick-angle loss diverges, or it stays at that of a uniform
 distribution. Each is the second-best rate of that `reference`."""
 MATCHED = "matched"
-"""The preset in which a baseline's networks are smaller than the original by the same factor as the
-SO(2) networks; see `paper.parameter_table`."""
+"""The preset in which a baseline's networks are smaller than their originals by the same factor as
+the SO(2) networks are; see `paper.parameter_table`."""
 ROTATIONS = 18
 """The number of rotations, of 36, in a training step of the Transporter in the cells of
 `_every_chance`."""
@@ -135,7 +135,7 @@ def _headline_seeds() -> list[Cell]:
 
 
 def _ablation() -> list[Cell]:
-    """Returns cells with all our extensions, and cells with all but one of them."""
+    """Returns cells with our extensions, with recovery in addition, and with an extension left out."""
 
     def ours(task: str, label: str, **changes: Any) -> Cell:
         kept = ("taken_only", "rigid")
@@ -169,9 +169,9 @@ def _ablation() -> list[Cell]:
 def _every_chance() -> list[Cell]:
     """Returns cells in which the baselines get larger networks and longer training.
 
-    They are on the tasks on which the baselines score lower than in the paper. The networks are
-    smaller than the originals by the same factor as the SO(2) networks. The Transporter also learns
-    from more rotations per step, in more steps.
+    They are on the tasks on which the baselines score lower than in the paper. Their networks
+    have the preset `MATCHED`; in the other cells they are smaller. The Transporter also learns from
+    more rotations per step, in more steps.
     """
     trainings = [
         *(
@@ -230,7 +230,8 @@ SHIPPED = {
     "shape_matching": "!ShapeMatching {}",
     "oracle": "!Oracle {}",
 }
-"""The shipped policies with all extensions; `!Learned {}` uses the scenario's weights."""
+"""The shipped policies with all extensions, as YAML, by the labels of their cells. `!Learned {}`
+uses the scenario's weights."""
 
 
 def _fresh_tools() -> list[Cell]:

@@ -60,7 +60,7 @@ class Queue:
     workers: int = 1
     """The number of episodes that run in parallel."""
     _wanted: dict[str, int] = field(default_factory=dict, init=False)
-    """The largest number of training demonstrations of each task in this run."""
+    """By task, the largest number of training demonstrations that a cell of this run needs."""
     _collected: set[Path] = field(default_factory=set, init=False)
     """The folders of demonstrations that have been checked."""
     _failed: dict[Path, str] = field(default_factory=dict, init=False)
@@ -174,8 +174,9 @@ class Queue:
         )
 
     def _best_rate(self, chosen_by: Training) -> float:
-        """Returns the learning rate with the best validation result in a training of `reference`.
+        """Returns the learning rate with the best validation result.
 
+        The training `chosen_by` comes from `reference`; it is done once with each learning rate.
         Each result is saved at once and not computed again.
         """
         for rate in self._untried(chosen_by):
@@ -193,7 +194,7 @@ class Queue:
         return float(best_rate(read_rates(self.results)[rates_key(chosen_by)]))
 
     def _untried(self, chosen_by: Training) -> list[float]:
-        """Returns the learning rates that a training of `reference` has not tried."""
+        """Returns the learning rates with which `chosen_by` has not been trained yet."""
         tried = read_rates(self.results).get(rates_key(chosen_by), {})
         return [rate for rate in LEARNING_RATES if f"{rate:g}" not in tried]
 
