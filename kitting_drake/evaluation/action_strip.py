@@ -1,4 +1,4 @@
-"""Draws a strip of frames: o_t before each action of an episode, and the action's outcome."""
+"""Draws an episode as a strip: the observation o_t before each action, and the action's outcome."""
 
 import io
 from collections.abc import Sequence

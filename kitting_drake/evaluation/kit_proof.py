@@ -152,8 +152,8 @@ def prove_kit(
     """Lets a policy fill a kit in simulation, and writes `proof.html` and `proof.json` into its
     folder.
 
-    The policy is that of the kit's scenario. In each episode the tools lie at other poses, and
-    all cavities are wider or narrower by a common random error with the standard deviation
+    The policy is that of the kit's scenario. In each episode the tools lie at other poses. All
+    cavities are wider or narrower by the same random error, with the standard deviation
     `TOLERANCE_MM`. A kit that does not fit is tried again with wider cavities, if these may mend
     its failures. A clearance at which the kit certainly does not fit gets no further episodes.
 

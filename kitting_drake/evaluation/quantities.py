@@ -1,4 +1,4 @@
-"""Formats counts and times with three digits and a unit prefix, and makes tables of them."""
+"""Formats counts and times with three significant digits, and makes tables of them."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from rich.table import Table
 
 
 def seconds_text(seconds: float | None) -> str:
-    """Formats a time with three digits, in s or ms."""
+    """Formats a time in s or ms, rounded to three significant digits; from 100 s on, to seconds."""
     if seconds is None:
         return "-"
     if seconds >= 100:
@@ -15,7 +15,7 @@ def seconds_text(seconds: float | None) -> str:
 
 
 def count_text(count: float) -> str:
-    """Formats a count with three digits and the prefix k, M, G or T."""
+    """Formats a count with three significant digits, and the prefix k, M, G or T."""
     for power, letter in ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k")):
         if count >= power:
             return f"{count / power:.3g} {letter}"

@@ -183,8 +183,8 @@ def counted_objects(episodes: Sequence[Episode]) -> list[list[Entry]]:
     """The objects of each episode that count: those for which a goal was left.
 
     In a failed or timed-out episode no object is a success or has errors. If the episode's process
-    died, its objects may be unknown. Such an episode gets, in each category, the largest number of
-    objects that any episode has in this category; all of them count as failed.
+    died, its objects may be unknown. Such an episode counts, for each category, as many failed
+    objects as the episode with the most objects of this category.
     """
     found = [
         [item for item in episode["objects"] if item["add_s_mm"] is not None]

@@ -33,7 +33,8 @@ _STYLE = {
 
 _LENGTHS = (0.1, 300.0)
 _ANGLES = (0.02, 180.0)
-"""Ranges of the axes, in mm and degrees. Values outside a range are drawn at its end."""
+"""Ranges of the axes: `_LENGTHS` in mm, `_ANGLES` in degrees. Values outside a range are drawn at
+its end."""
 
 
 @dataclass(frozen=True)

@@ -98,7 +98,7 @@ class AnnotationServer(ThreadingHTTPServer):
             return self._read(self.steps[index].path)
 
     def describe(self) -> dict[str, Any]:
-        """Returns the grid and the steps as JSON for the page, in metres and radians."""
+        """Returns the grid, the jaws and the steps as JSON for the page, in metres and radians."""
         grid = self.calibration.grid
         return {
             "grid": {

@@ -31,7 +31,7 @@ _TILT = 12
 _UNDONE = 1e-4
 """The largest accepted error, at depth 1, of a ray that is undistorted and then distorted again."""
 _WIDEST = np.deg2rad(85)
-"""The largest angle of a ray from the optical axis, in radians."""
+"""The largest angle between the optical axis and an undistorted ray, in radians."""
 
 
 def known_model(name: object, where: str) -> str:

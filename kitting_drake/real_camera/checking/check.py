@@ -178,8 +178,8 @@ def _plane_of(points: Array, camera: BenchCamera) -> Plane:
     seen = points[np.isfinite(points[..., 2])]
     if len(seen) < _LEAST_POINTS:
         raise UserError(
-            f"camera {camera.name} sees almost nothing within "
-            f"{1e3 * FARTHEST:.0f} mm of the table's height: check its pose and table_height"
+            f"camera {camera.name} sees almost nothing within {1e3 * FARTHEST:.0f} mm of the "
+            "table's height: check the camera's pose and table_height"
         )
     return fit_plane(seen)
 

@@ -22,8 +22,8 @@ CHECK_FILES = ("check.json", "corrected.yaml", "check.png")
 FOUND_FILES = ("found.yaml", "found.png")
 """The files that `save_found` writes."""
 _WELL_SEEN = 0.9
-"""The user is told if the cameras look at less than this share of the workspace, or measure less
-than this share of the pixels in view."""
+"""The least share of the workspace that should be in view, and the least share of the pixels in
+view that should have a depth. Lower shares are reported."""
 
 
 def print_decision(console: Console, record: dict[str, Any]) -> None:

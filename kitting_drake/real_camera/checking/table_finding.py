@@ -45,8 +45,8 @@ _LEAST_SHARE = 0.1
 _LEAST_POINTS = 500
 """The least number of points that must lie on the table."""
 _ABOVE_FLOOR = 0.25
-"""If another level plane is higher than the largest one by more than this, in metres, it is the
-table and the largest plane is the floor."""
+"""A level plane that is higher than the largest plane by more than this, in metres, is the table.
+The largest plane is then the floor."""
 _TABLE_SHARE = 0.1
 """The least number of points of a table above a floor, as a share of the floor's points."""
 _BAND = 0.006
@@ -70,8 +70,8 @@ _AROUND = 0.02
 _TOO_NEAR = 0.25
 """An arm cannot pick within this distance of the middle of its base, in metres."""
 _ENOUGH = 0.6
-"""A workspace farther from the base than `_TOO_NEAR` is preferred if it holds more than this share
-of the largest table area that a workspace can hold."""
+"""Workspaces nearer to the base than `_TOO_NEAR` are excluded, unless all others hold less than
+this share of the largest possible table area."""
 _NEARLY = 0.97
 """Workspaces count as equally good if they hold at least this share of the table area of the best
 one. The nearest of them is chosen."""

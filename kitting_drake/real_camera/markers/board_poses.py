@@ -25,8 +25,8 @@ corners are poor."""
 _SAME = math.radians(1)
 """The angle in radians below which two poses count as the same."""
 _CLEARER = 16.0
-"""A pose is ambiguous if another pose raises the sum of the corners' squared errors by less than
-this multiple of the error variance of one corner."""
+"""Two poses are ambiguous if their sums of the corners' squared errors differ by less than this
+multiple of the error variance of one corner."""
 _LIKELY = 0.2
 """The least error of corners, in pixels, that is assumed in the test for ambiguous poses."""
 _NOISE = 0.05

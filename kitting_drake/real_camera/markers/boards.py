@@ -257,8 +257,8 @@ def _length(content: dict[str, Any], key: str, path: Path) -> float:
 
 
 def _pose(content: dict[str, Any], size: tuple[float, float], path: Path) -> Array:
-    """Returns the pose (4, 4) of the board in the base: the given one, or that of three corners
-    that were touched with the robot."""
+    """Returns the pose (4, 4) of the board in the base: the given one, or one computed from three
+    corners that the robot touched."""
     if ("pose" in content) == ("touch" in content):
         raise UserError(
             f"{path} must have either 'pose' (of the board in the base frame) or 'touch' (the "

@@ -1,9 +1,10 @@
 """Measures how a policy recovers from a failed action (`benchmark recovery`).
 
 The first action of each episode is made to fail in one of three ways: the object is moved while the
-hand comes down, the grasp is off, or the place is off. The benchmark counts how often this object
-is in its cavity in the end. It also counts how often an object that was in its cavity is picked
-again, or is not in its cavity in the end. Episodes without an induced failure are the baseline.
+hand comes down, the grasp is displaced, or the place is displaced. The benchmark counts how often
+this object is in its cavity in the end. It also counts how often an object that was in its cavity
+is picked again, or is not in its cavity in the end. Episodes without an induced failure are the
+baseline.
 """
 
 import dataclasses

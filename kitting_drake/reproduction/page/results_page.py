@@ -1,6 +1,6 @@
 """Writes the page of results, docs/results.md.
 
-It has the main figures, the departures from the paper, and how to reproduce both.
+It has the main figures, how to reproduce them, and the departures from the paper.
 """
 
 from collections.abc import Sequence

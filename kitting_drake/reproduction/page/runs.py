@@ -309,7 +309,7 @@ def check_summary(summary: Any, where: str) -> None:
 
     Args:
         summary: the content of a file, or of a row.
-        where: the file and the run that it is from, for the error message.
+        where: the file and the run of the summary, for the error message.
 
     Raises:
         UserError: a field is missing or of another type.

@@ -29,9 +29,9 @@ STEADIER = {
     ("palletizing_boxes", "equivariant_transporter", 1): 1e-3,
     ("stack_block_pyramid", "equivariant_transporter", 100): 1e-3,
 }
-"""Learning rates, by task, method and number of demonstrations, of trainings that fail at the best
-rate of their `reference`: the pick-angle loss diverges, or it stays at that of a uniform
-distribution. Each is the second-best rate of that `reference`."""
+"""Learning rates by task, method and number of demonstrations, for trainings that fail at the best
+rate of their `reference`. Their pick-angle loss diverges, or it stays at that of a uniform
+distribution. They use the second-best rate of their `reference` instead."""
 MATCHED = "matched"
 """The preset in which a baseline's networks are smaller than their originals by the same factor as
 the SO(2) networks are; see `paper.parameter_table`."""
@@ -135,7 +135,7 @@ def _headline_seeds() -> list[Cell]:
 
 
 def _ablation() -> list[Cell]:
-    """Returns cells with our extensions, with recovery in addition, and with an extension left out."""
+    """Returns cells with our extensions, with recovery too, and with one extension left out."""
 
     def ours(task: str, label: str, **changes: Any) -> Cell:
         kept = ("taken_only", "rigid")
