@@ -103,7 +103,7 @@ def _pose_of_echo(text: str, path: Path) -> FoundPose:
             f"{path} must have three numbers after Translation and four after Quaternion"
         )
     table = np.array(values)
-    # A quaternion and its negative are the same rotation.
+    # Give all quaternions the sign of the last one: q and -q are the same rotation.
     table[:, 3:] *= np.where(table[:, 3:] @ table[-1, 3:] < 0, -1, 1)[:, None]
     if np.ptp(table, axis=0).max() > _STILL:
         raise UserError(

@@ -57,7 +57,7 @@ def trace(mask: Mask, grid: PixelGrid) -> Polygon:
 
 def _border(mask: Mask) -> Array:
     """Returns the corners (n, 2) of the cells along the outer border, in order, as (row, col)."""
-    # Walk along the sides of cells with the mask on the right.
+    # Pad the mask, and walk along the sides of its cells, with the mask on the right.
     padded = np.pad(mask, 1)
     row, col = np.argwhere(padded)[0]
     start = position = (int(row), int(col))

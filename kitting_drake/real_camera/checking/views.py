@@ -204,7 +204,8 @@ def _check_depth(frame: Frame, camera: BenchCamera, calibration: Calibration) ->
             "is 1 mm by default"
         )
     else:
-        return  # `check_table` explains other errors better.
+        # `check_table` explains other errors better.
+        return
     raise CalibrationError(f"{told}: {hint}")
 
 

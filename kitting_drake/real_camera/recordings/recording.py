@@ -160,7 +160,7 @@ class _Mcap(Recording):
         self._reader, self._start = reader, summary.statistics.message_start_time
 
     def messages(self, topics: Sequence[str]) -> Iterator[RecordedMessage]:
-        # An empty selection would mean all topics.
+        # Without topics, select a topic that does not exist: an empty list would mean all topics.
         for _, channel, message, body in self._reader.iter_decoded_messages(topics or [""]):
             yield _message(channel.topic, message.log_time, self._start, body)
 

@@ -55,7 +55,7 @@ def _json_text(trajectory: ArmTrajectory, joint_names: Sequence[str], robot: dic
         | {"time_from_start": _ros_time(i / trajectory.rate)}
         for i in range(len(trajectory.positions))
     ]
-    # Put each point on a line of its own.
+    # Add the points after the other fields, each on a line of its own.
     text = json.dumps(head, indent=2).removesuffix("\n}")
     names = json.dumps(list(joint_names))
     lines = ",\n".join(f"      {json.dumps(point)}" for point in points)

@@ -172,7 +172,7 @@ def _compute_others(networks: Networks, setup: SpeedSetup, n: int) -> Callable[[
     search."""
 
     def compute() -> None:
-        # The Transporter computes positions together with angles.
+        # Skip the Transporter, which computes positions together with angles.
         if isinstance(networks, FactoredNetworks):
             networks.position_logits(setup.image)
         networks.encode_scene(setup.image)

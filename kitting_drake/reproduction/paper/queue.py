@@ -217,7 +217,7 @@ class Queue:
             folder=folder,
         )
         text = (folder / "summary.json").read_text()
-        # Do not store absolute paths in results.
+        # Make the path of the weights relative, because results must not hold absolute paths.
         if weights is not None:
             name = str(weights.resolve().relative_to(self.folder.resolve()))
             text = text.replace(json.dumps(str(weights.resolve())), json.dumps(name))
