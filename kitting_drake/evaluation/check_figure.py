@@ -15,8 +15,7 @@ from systems.signals import PixelGrid
 
 
 def draw_heights(heights: Mapping[str, NDArray[np.float32]], grid: PixelGrid) -> bytes:
-    """Draws heights above the table, seen from above: for each camera, and for all cameras
-    together.
+    """Draws maps of the heights above the table, for each camera and for all cameras together.
 
     Args:
         heights: (rows, cols) heights in metres, by the camera's name; the empty name stands for all

@@ -20,7 +20,8 @@ from kitting_drake.evaluation.intervals import proportion_interval
 from kitting_drake.scenario.choosing import find_scenario
 
 TOLERANCE_MM = 0.1
-"""The standard deviation of the error of a printed cavity's walls, in mm on each side."""
+"""The standard deviation of the error by which a printed cavity is wider or narrower, in mm on each
+side."""
 _OFF = "wrong height or heading"
 _TIGHT = ("insertion blocked", "misplaced", _OFF)
 """The causes of failures that a wider cavity may mend."""
@@ -159,7 +160,7 @@ def prove_kit(
 
     Args:
         folder: a folder that `hkd kit` wrote.
-        episodes: number of simulated episodes.
+        episodes: the number of simulated episodes with each clearance.
         progress: a function that is called before the first and after each episode.
         tools: names or folders of the tools to put into the cavities, one for each cavity; by
             default the tools for which the cavities were made.

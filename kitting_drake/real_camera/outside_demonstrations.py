@@ -64,7 +64,7 @@ class Summary:
 
 
 def find_demonstrations(folder: Path) -> list[list[StepFolder]]:
-    """Returns the steps of each demonstration, in the natural order of their names.
+    """Returns the steps of each demonstration, in the order of their names, with 2 before 10.
 
     Args:
         folder: it holds a folder for each demonstration, which in turn holds a folder for each
@@ -127,7 +127,7 @@ def check_action(step: StepFolder, action: StepAction, calibration: Calibration)
 
     Raises:
         UserError: the action stops before the last step; or it was clicked with another
-            calibration, in which the same point has other coordinates.
+            calibration, so its coordinates do not hold in this one.
     """
     if action.action.stop and not step.is_last:
         raise UserError(

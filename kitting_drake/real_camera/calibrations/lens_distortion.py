@@ -109,7 +109,7 @@ def undistort(
         order = "k1, k2, k3, k4" if model == EQUIDISTANT else "k1, k2, p1, p2, k3"
         raise UserError(
             f"the distortion of camera {name} cannot be inverted over the whole image: check the "
-            f"order {order}, or rectify the images"
+            f"order of its coefficients ({order}), or rectify the images"
         )
     return x, y
 

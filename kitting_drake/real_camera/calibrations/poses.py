@@ -68,7 +68,7 @@ def read_pose(node: dict[str, Any], where: str, folder: Path) -> Array:
     if body:
         raise UserError(
             f"{found.where} is the pose of {body}, the camera's body: also give optical_to_link "
-            f"there; the command `tf2_echo {body} ..._optical_frame` prints it"
+            f"beside it; the command `tf2_echo {body} ..._optical_frame` prints it"
         )
     if not found.in_hand:
         if "hand_to_base" in node:

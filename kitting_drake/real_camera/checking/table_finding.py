@@ -56,7 +56,7 @@ _LOW = 0.12
 """The largest height of an object on the table, in metres. Anything taller, such as the robot, is
 not part of the table."""
 _TALL = 1.2
-"""The height above the table, in metres, above which points are ignored."""
+"""Points that are higher above the table than this, in metres, are ignored."""
 _CLOSED = 0.035
 """Half the width, in metres, of the widest gap in the table that is closed. Gaps come from objects
 and shadows."""
@@ -66,7 +66,8 @@ table. Narrower things, such as profiles along the edge, do not count."""
 _LEAST_TALL = 0.02
 """The width below which tall things count as noise, in metres."""
 _AROUND = 0.02
-"""The width of a margin around tall things, in metres. The margin is ignored as well."""
+"""The width of the margin around tall things, in metres. Tall things and their margins are
+ignored."""
 _TOO_NEAR = 0.25
 """An arm cannot pick within this distance of the middle of its base, in metres."""
 _ENOUGH = 0.6

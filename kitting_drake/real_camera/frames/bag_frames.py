@@ -124,8 +124,8 @@ def _first_pair(
 def _settled(
     colors: list[RecordedMessage], depths: list[RecordedMessage], ended: bool
 ) -> tuple[RecordedMessage, RecordedMessage] | None:
-    """Returns the first pair of images, if no later colour image can be closer to its depth image
-    in time; else None.
+    """Returns the first pair of images, or None if a later colour image might be closer in time to
+    the depth image.
 
     Images that cannot belong to a pair are removed from the lists.
 

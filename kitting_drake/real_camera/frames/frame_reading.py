@@ -222,7 +222,7 @@ def _find(folders: Sequence[Path], name: str, alone: bool) -> _Sources:
         others = (*colors, *depths)
         raise UserError(
             f"camera {name}: {', '.join(map(str, folders))} has both {whole[0].name} and "
-            f"{others[0].name}: keep one frame only"
+            f"{others[0].name}: keep only one of them"
         )
     if not depths:
         for path in _candidates(folders, name, alone, ("depth", "frame"), tuple(_CONVERSIONS)):

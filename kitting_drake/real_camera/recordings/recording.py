@@ -109,7 +109,8 @@ def camera_info_of(path: Path, stream: str) -> dict[str, Any]:
 
 
 def camera_info_fields(body: Any) -> dict[str, Any]:
-    """Returns the fields of a CameraInfo message, by their names in ROS 2, for the calibration."""
+    """Returns the fields of a CameraInfo message that a calibration needs, by their names in ROS
+    2."""
     roi = body.roi
     return {
         "width": int(body.width),

@@ -148,7 +148,7 @@ def _is_outside(base: ArmBase, grid: PixelGrid) -> bool:
 
 
 def _bases(given: ArmBase, grid: PixelGrid) -> list[ArmBase]:
-    """Returns the bases to try around the workspace, at multiples of the step."""
+    """Returns the bases to try around the workspace, at multiples of `_STEP`."""
 
     def around(low: float, high: float) -> range:
         return range(math.ceil((low - _AROUND) / _STEP), math.floor((high + _AROUND) / _STEP) + 1)

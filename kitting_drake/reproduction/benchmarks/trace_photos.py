@@ -65,8 +65,7 @@ class PhotoSpec:
     softness: float = 0.15
     """The standard deviation of `light` among the lamps, which makes shadows soft."""
     falloff: float = 0.25
-    """How uneven the light is: its relative change along a slanted line across the sheet, from the
-    middle to each end."""
+    """How uneven the light is: roughly its relative change from the sheet's middle to its edge."""
     blur: float = 1.0
     """The standard deviation of the blur, in pixels."""
     noise: float = 0.006

@@ -82,7 +82,10 @@ def measure_pick_angles(setup: SpeedSetup, preset: str) -> list[dict[str, Any]]:
 
 
 def _cells(plan: Plan) -> Iterator[tuple[str, tuple[int, ...]]]:
-    """Yields each method with the values of N at which one set of its networks can predict."""
+    """Yields methods, each with the values of N at which the same networks can predict.
+
+    A method whose architecture depends on N is yielded for one N at a time.
+    """
     for method in METHODS:
         if method in _MADE_FOR_N:
             yield from ((method, (n,)) for n in plan.orientations)

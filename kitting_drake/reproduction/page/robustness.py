@@ -180,7 +180,7 @@ def _check_seeds(found: Mapping[Key, Sequence[Run]]) -> None:
 
 
 def _common(run: Run, label: str) -> bool:
-    """Whether a run has the seeds that all cells share."""
+    """Whether a run has the seeds that the cells of its table share."""
     seeds = list(run.summary["seeds"])
     if _is_other_level(label):
         return len(seeds) >= _FEWEST and seeds == list(_SEEDS)[: len(seeds)]

@@ -36,7 +36,7 @@ MATCHED = "matched"
 """The preset in which a baseline's networks are smaller than their originals by the same factor as
 the SO(2) networks are; see `paper.parameter_table`."""
 ROTATIONS = 18
-"""The number of rotations, of 36, in a training step of the Transporter in the cells of
+"""The number of rotations (out of 36) in a training step of the Transporter in the cells of
 `_every_chance`."""
 EVERY_CHANCE = "every_chance"
 """The label of the cells of `_every_chance`."""

@@ -324,7 +324,7 @@ def both_kinds(folder: Path) -> None:
         (npz(color=COLOR.astype(float), depth=DEPTH), "must be bytes of shape .* of float64"),
         (npz(color=COLOR, depth=DEPTH[None]), "front.npz: depth must have one channel, not 8"),
         (npz(color=COLOR[:3], depth=DEPTH), "front.npz is 8x3 pixels, but camera front was"),
-        (both_kinds, "has both front.npz and color.png: keep one frame only"),
+        (both_kinds, "has both front.npz and color.png: keep only one of them"),
         (double_tiff, "it is not an image of 8 or 16 bits, or of 32-bit floats"),
         (two_page_tiff, "depth.tif holds 2 images"),
         (colour_exr, "has the channels .*: write depth alone, in the channel Z"),

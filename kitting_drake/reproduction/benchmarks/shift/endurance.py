@@ -41,7 +41,7 @@ _LINES = "scenes.jsonl"
 _MOST_LOST = 20
 """The shift is aborted after this number of scenes in a row that could not begin."""
 _BELOW = 0.05
-"""The depth of an object's origin below the table's top, in m, at which it has fallen off the
+"""An object whose origin is deeper than this below the table's top, in m, has fallen off the
 table."""
 _WIDTH = 0.5
 """The width of the bins of the histogram of cycles, in s."""
@@ -250,7 +250,7 @@ class _Watch:
 
 
 def is_on_table(p_WB: Any) -> bool:
-    """Whether a point (3,) is over the table and not below its top; false for NaN."""
+    """Whether a point (3,) is over the table, and at most `_BELOW` below its top; false for NaN."""
     low, high = TABLE
     return bool(np.all(p_WB[:2] >= low) and np.all(p_WB[:2] <= high) and p_WB[2] > -_BELOW)
 
