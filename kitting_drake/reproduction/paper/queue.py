@@ -287,7 +287,7 @@ def _check_training(training: Training, folder: Path) -> None:
         found = summary.get(key, _BEFORE.get(key))
         if found != wanted:
             raise Failed(
-                f"{folder} holds another training ({key} is {found}, not {wanted}): delete the folder"
+                f"{folder} holds another training ({key} is {found}, not {wanted}): delete it"
             )
 
 
