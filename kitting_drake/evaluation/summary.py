@@ -64,9 +64,9 @@ def summarise(
     - If the reward is the share of successful objects, and the task declares its objects
       independent, intervals are Wilson's over objects. Otherwise (partial rewards, weights, stacks)
       they are over episodes, see `mean_interval`. `ci95_method` names the method.
-    - `outcomes` holds the seed, the success rate and the strict success rate of each episode, and
-      for each object 2 (strict success), 1 (success) or 0 (failure). It allows paired comparisons
-      of runs with the same seeds.
+    - `outcomes` holds the seed, the success rate and the strict success rate of each episode. For
+      each object it holds 2 (strict success), 1 (success) or 0 (failure). It allows paired
+      comparisons of runs with the same seeds.
     - Errors include all objects and actions of completed episodes, also failed objects and actions.
       Objects for which no goal was left are excluded.
     - `measures` holds, for each further measure of the task, the share of objects that succeed by

@@ -154,8 +154,8 @@ def get(node: dict[str, Any], key: str, where: str) -> Any:
 
 
 def refuse_two(node: dict[str, Any], keys: tuple[str, ...], where: str) -> str | None:
-    """Returns which of several fields is given, or None if none is; raises UserError if more than
-    one is given."""
+    """Returns which of several fields is given; None if none is. Raises UserError if several are
+    given."""
     given = [key for key in keys if key in node]
     if len(given) > 1:
         raise UserError(f"{where} has {' and '.join(given)}: give one of them")

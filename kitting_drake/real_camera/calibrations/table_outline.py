@@ -39,8 +39,8 @@ class TableOutline:
     ignore: tuple[Polygon, ...] = ()
     """Polygons in which there is no table."""
     mask: tuple[bytes, ...] = ()
-    """One string of bytes for each row of the workspace, with 1 for a pixel of the table and 0 for
-    any other; empty if the table is everywhere."""
+    """One string of bytes for each row of the workspace: 1 for a pixel of the table, 0 for any
+    other. Empty if the table is everywhere."""
 
     def inside(self, grid: PixelGrid) -> NDArray[np.bool_] | None:
         """Returns a mask (rows, cols) of the pixels whose centres are on the table; None if there

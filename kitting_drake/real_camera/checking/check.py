@@ -96,8 +96,8 @@ def check_cameras(
 
     Each camera's pose is corrected by a rotation that makes the table level, and then by a vertical
     shift. With a block, the cameras are also shifted horizontally and rotated about the vertical,
-    so that they agree on the block's pose. The block's pose is that in `block`, if it is given, or
-    else the mean of the poses that the cameras see.
+    so that they agree on the block's pose. The block's pose is `block.pose`, or the mean of the
+    poses that the cameras see if `block.pose` is None.
 
     Args:
         frames: a frame of each camera, by camera name, with nothing but the block on the table.

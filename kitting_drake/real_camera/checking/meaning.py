@@ -197,8 +197,10 @@ def scales(seen: SeenBlock, block: Block) -> tuple[float, float, float]:
 
 
 def offset(seen: SeenBlock, block: Block) -> tuple[float, float, float] | None:
-    """Returns how far a block seems to be from its true pose: x and y in metres, and yaw in
-    radians, modulo `Block.period`. Returns None if the true pose is not known."""
+    """Returns how far a block seems to be from its true pose; None if the true pose is not known.
+
+    The values are x and y in metres, and the yaw in radians, modulo `Block.period`.
+    """
     if block.pose is None:
         return None
     x, y = seen.middle - np.array(block.pose[:2])

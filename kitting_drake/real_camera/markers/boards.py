@@ -46,8 +46,9 @@ _LARGEST = 2.0
 class Board:
     """A board of markers that lies flat on the table.
 
-    The board's frame M, as seen from above with the print upright: the origin is the lower left
-    corner of the pattern, x points right, y up along the print, and z out of the print.
+    The origin of the board's frame M is the lower left corner of the pattern, as seen from above
+    with the print upright. Its x points right, its y up along the print, and its z out of the
+    print.
     """
 
     path: Path

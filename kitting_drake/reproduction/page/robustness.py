@@ -145,8 +145,8 @@ def _table(found: Mapping[Key, Sequence[Run]], labels: Sequence[str], counted: b
 
 
 def _needless_table(found: Mapping[Key, Sequence[Run]], labels: Sequence[str]) -> str:
-    """Writes a table of the actions on objects without a cavity, with one row for each perturbation
-    with distractors; it is empty without runs."""
+    """Writes a table of the actions on objects without a cavity; it is empty without runs. It has
+    one row for each perturbation with distractors."""
 
     def share(key: Key) -> str:
         summaries = [run.summary for run in found.get(key, ())]

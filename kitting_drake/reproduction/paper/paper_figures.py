@@ -110,8 +110,8 @@ def _draw_marker(
 def draw_table_1(results: Mapping[str, Result]) -> bytes:
     """Draws the mean reward of each Ravens task over the number of demonstrations, as a PNG.
 
-    A filled marker is our result with its 95 % interval, a star is our result with extensions, and
-    a hollow marker is the paper's figure for the same cell. A cell without a run is left out, and
+    A filled marker is our result with its 95 % interval. A star is our result with extensions. A
+    hollow marker is the paper's figure for the same cell. A cell without a run is left out, and
     so is the paper's figure for it. A task without a run has no panel.
 
     Args:

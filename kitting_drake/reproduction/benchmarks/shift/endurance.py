@@ -1,9 +1,9 @@
 """Runs scene after scene without a person, until a simulated work shift is over (`benchmark
 endurance`).
 
-A unit is a tool that is placed strictly. An assist is one object that a person must put right at
-the end of a scene, because it is not placed strictly: the policy gave it up, it is misplaced, or it
-is off the table. In a scene that fails or times out, every object is an assist. The person puts
+A unit is a tool that is placed strictly. An assist is an object that is not placed strictly, so a
+person must put it right at the end of the scene: the policy gave it up, it is misplaced, or it is
+off the table. In a scene that fails or times out, every object is an assist. The person puts
 objects right while the kits are exchanged.
 
 A cycle is the simulated time from one unit to the next within a scene, failed actions included. The
