@@ -1,4 +1,4 @@
-"""Judges a decision on a drawn scene by its geometry, without physics."""
+"""Judges a decision on a static scene by geometry, without physics."""
 
 from __future__ import annotations
 

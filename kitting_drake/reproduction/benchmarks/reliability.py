@@ -1,7 +1,7 @@
-"""Measures how reliable the confidence of decisions is, on drawn scenes with random cameras.
+"""Measures how reliable the confidence of decisions is, on static scenes with random cameras.
 
-Scenes are drawn as for training, with seeds that no training uses. Decisions are judged by geometry
-(`judging`), without physics.
+Scenes are drawn at random as for training, with seeds that no training uses. Decisions are judged
+by geometry (`judging`), without physics.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Measures the error of outlines that are traced from drawn photos of known tools (`benchmark
+"""Measures the error of outlines that are traced from rendered photos of known tools (`benchmark
 trace`)."""
 
 import math
@@ -54,7 +54,7 @@ def benchmark_trace(
     exif: bool = True,
     seed: int = 0,
 ) -> dict[str, Any]:
-    """Draws three photos of each tool, traces them and measures the outlines, in mm.
+    """Renders three photos of each tool, traces them and measures the outlines, in mm.
 
     There are separate errors for the outlines about which the tracer reports no doubts. There are
     also errors without gaps below `GAP_MM`: in a photo, a tool's sides hide narrow gaps, and its

@@ -1,4 +1,4 @@
-"""Draws photos of tools with known outlines on a sheet of paper, for `benchmark trace` and the
+"""Renders photos of tools with known outlines on a sheet of paper, for `benchmark trace` and the
 tests.
 
 A tool is an upright prism over its outline. It is drawn through a tilted pinhole camera with its
@@ -123,7 +123,7 @@ class _Camera:
 def draw_photo(
     tools: list[PlacedTool], spec: PhotoSpec, printed: PlacedPrint | None = None
 ) -> bytes:
-    """Draws a photo of tools on a sheet, as a JPEG."""
+    """Renders a photo of tools on a sheet, as a JPEG."""
     cv2 = import_extra("cv2", purpose="benchmark trace", extra="camera")
     rng = np.random.default_rng(spec.seed)
     camera = _camera(spec)

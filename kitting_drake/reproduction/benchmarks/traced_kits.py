@@ -1,4 +1,4 @@
-"""Kits whose cavities are traced from drawn photos, filled with the true tools (`benchmark
+"""Traces cavities from rendered photos, and fills the kits with the true tools (`benchmark
 traced_kits`)."""
 
 import dataclasses
@@ -40,7 +40,7 @@ def measure_traced_kits(
     """Makes kits of four tools from traced photos, and lets the oracle fill them with the true
     tools, with one try for each. Skips the kits that are in the folder already.
 
-    The photos are drawn as for `benchmark trace`, with each tool's own height. If the tracer
+    The photos are rendered as for `benchmark trace`, with each tool's own height. If the tracer
     refuses a photo or doubts its outline, another photo is taken, as `hkd trace` asks.
 
     Args:
