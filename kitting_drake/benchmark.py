@@ -454,7 +454,8 @@ def _mujoco(arguments: argparse.Namespace, console: Console, folder: Path) -> li
 
 
 def _paper(arguments: argparse.Namespace, console: Console, folder: Path) -> int:
-    """Runs the experiments for cells of the result tables; returns the exit code."""
+    """Runs the experiments for the cells of docs/results.md that `--cells` names; returns the exit
+    code."""
     from kitting_drake.reproduction.paper.paper_tables import choose_cells
     from kitting_drake.reproduction.paper.queue import Queue, run_paper
 

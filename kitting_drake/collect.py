@@ -84,7 +84,7 @@ def main() -> int:
         console.print(f"note: {note}", highlight=False, markup=False)
     start = time.perf_counter()
     with alone_in(folder):
-        # Check this before claiming the folder.
+        # Check before a folder is claimed, so that a failure leaves no folder behind.
         if not chosen.scenario.cameras:
             raise UserError(f"{chosen.path}: cameras is empty: collect needs at least one camera")
         require_rendering()
@@ -93,7 +93,7 @@ def main() -> int:
         identity = {
             **chosen.described,
             "versions": versions(),
-            # The digest changes when the user imports or annotates a tool again.
+            # Refuse to mix demonstrations from before and after a tool is imported again.
             "task_digest": files_digest(chosen.scenario.task.input_files(chosen.base)),
         }
         claim_folder(folder, "scenario.json", identity, of="scenario, tools or version")

@@ -1,7 +1,7 @@
 """`python -m kitting_drake.decide FRAME... --camera CALIBRATION.yaml`: decides on one action.
 
-Computes a pick and place in the robot's frame from frames of real cameras, without Drake. See
-docs/bench.md.
+Computes a pick and a place in the robot's base frame from the images of real cameras, without
+Drake. See docs/bench.md.
 """
 
 import argparse
@@ -356,7 +356,7 @@ def _block(arguments: argparse.Namespace, grid: PixelGrid) -> Block | None:
     if pose is not None and not grid.contains(pose[:2]):
         raise UserError(
             f"--kit_pose: ({pose[0]:g}, {pose[1]:g}) m is outside the workspace: give x and y of "
-            "the block's middle in m"
+            "the kit block's middle in m"
         )
     if pose is not None and abs(pose[2]) > math.tau:
         raise UserError(f"--kit_pose: the yaw {pose[2]:g} is more than a full turn: give it in rad")

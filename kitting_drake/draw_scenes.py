@@ -94,7 +94,7 @@ class _Parts:
             drawn_by: the versions, sources and designs that determine the scenes.
 
         Raises:
-            UserError: a file was drawn with another seed or version, or is damaged.
+            UserError: a file was drawn with another seed or other versions, or is damaged.
         """
         self._folder, self._seed, self._drawn_by = require_folder(folder), seed, drawn_by
         self._counts = {}
@@ -116,7 +116,8 @@ class _Parts:
         mine = (self._seed_of(batch), self._drawn_by, PixelGrid())
         if (found.first_seed, found.versions, found.grid) != mine:
             raise UserError(
-                f"{path} was drawn with another seed or version: delete it to draw it again"
+                f"{path} was drawn with another seed or another version of the code or its "
+                "packages: delete it to draw it again"
             )
         return found
 

@@ -5,8 +5,8 @@ docs/robustness.md. `--add` adds a run of `evaluate` to the runs, and `--remove`
 of a table shows the run that has the cell's name (see `benchmark paper`). Such a run is refused if
 it was made with uncommitted changes.
 
-The folder also has `learning_rates.json` from `benchmark paper`, and a copy of `networks.json` from
-`benchmark networks`. All numbers come from this folder, except those of the paper.
+docs/results/ also has `learning_rates.json` from `benchmark paper`, and a copy of `networks.json`
+from `benchmark networks`. All numbers come from this folder, except those of the paper.
 """
 
 import argparse
@@ -110,7 +110,8 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _draw(answers: Sequence[Result], efficiency: dict[str, Any] | None, folder: Path) -> None:
-    """Draws figure 6, the networks' run times and table I, if there are results for them."""
+    """Draws the paper's figure 6 and table I, and the networks' run times, as far as there are
+    results for them."""
     by_name = {answer.cell.name: answer for answer in answers}
     for task in ("seen", "unseen"):
         if has_figure(task, answers):

@@ -153,7 +153,7 @@ def _save_decisions(folder: Path, decisions: "list[tuple[Observation, Decision]]
 
 
 def _check_files(picture: Path | None, video: Path | None, replay: Path) -> None:
-    """Raises UserError if a file cannot be written after the episode."""
+    """Checks that the episode's files can be written; raises UserError if not."""
     if picture is not None and picture.suffix != ".png":
         raise UserError(f"--picture writes .png files, not '{picture}'")
     if video is not None and video.suffix not in (".gif", ".webp"):

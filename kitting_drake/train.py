@@ -118,7 +118,8 @@ def _checked_start(
     """Checks the weights of --from against the flags and the data.
 
     Returns:
-        The weights' network configuration, and their `card_seeds` and `learned_seeds`.
+        The weights' network configuration, the seeds of their training and validation data, and the
+        seeds of their training data by scenario.
 
     Raises:
         UserError: the weights do not match, or were trained on a seed of the validation data.
@@ -134,7 +135,8 @@ def _checked_start(
         )
     fixed = ["method", "preset", "orientations"]
     if arguments.angle_only:
-        # --angle-only trains a new pick-angle network, which may have another N and size.
+        # --angle-only trains a new pick-angle network, whose N and size may differ from those of
+        # --from.
         fixed = ["method"] if config.has_unets_of(arguments.preset) else ["method", "preset"]
     for flag in fixed:
         given, found = getattr(arguments, flag), getattr(config, flag)
@@ -328,7 +330,7 @@ def _split(
     """Returns the training and the validation data."""
     everything = read_training_data(path)
     total = everything.count
-    # By default, all data after the training data are for validation.
+    # Keep for validation a tenth of a given count; without a count, keep all that are left.
     most_kept = total if count is None else max(1, count // 10)
     if count is None:
         count = total if validation else _most_unrelated(everything, total - max(1, total // 11))

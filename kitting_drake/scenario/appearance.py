@@ -55,14 +55,15 @@ class Appearance:
     # a surface, the last one wins.
     paints: dict[str, Paint] = dc.field(default_factory=dict)
 
-    # The share, 0 to 1, of a surface's pixels that have no depth, by pattern as for paints.
+    # Shiny surfaces, by pattern as for paints: the fraction, 0 to 1, of their pixels for which the
+    # cameras measure no depth.
     sheen: dict[str, float] = dc.field(default_factory=dict)
 
     # The lights. If there are none, a light is at each camera.
     lights: list[Light] = dc.field(default_factory=list)
 
-    # If given, one to three random lights replace the lights above. Their total brightness is the
-    # normal brightness times a random factor between 1 - value and 1 + value.
+    # If given, one to three random lights replace the lights above. Their intensities add up to
+    # 1.3 times a random factor between 1 - value and 1 + value.
     drawn_lights: float | None = bounded(None, 0.0, 1.0)
 
     def validate(self) -> None:

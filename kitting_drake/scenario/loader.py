@@ -23,7 +23,7 @@ _APPROXIMATIONS = ("lagged", "similar", "sap")
 
 _PLAINLY_BELOW = 0.02
 """A negative heightmap.z_min must be at least this far below the table, in m. A smaller distance
-could be a calibration error of the cameras (see `systems.surface_heights`)."""
+cannot be told from a calibration error of the cameras (see `systems.surface_heights`)."""
 
 
 def load_scenario(
@@ -102,8 +102,8 @@ def _onto(raw: dict, defaults: Scenario) -> tuple[dict, Scenario]:
     """Returns the YAML and the defaults, prepared for merging.
 
     Drake reads an untagged mapping as the first type of a union. This function therefore adds the
-    tag of the default's type. If the YAML selects another type of task, each mapping in it replaces
-    the default mapping of the new type. Cameras that are null in the YAML are removed from both.
+    tag of the default's type. If the YAML selects another type of task, its mappings replace the
+    default mappings of that type. Cameras that are null in the YAML are removed from both.
 
     Raises:
         UserError: a camera that is null does not exist.
@@ -156,12 +156,13 @@ def _without_mappings(given: dict, current: Task) -> Task:
 
 
 def _of_variant(given: object, current: object) -> object:
-    """Adds the tag of the type of `current` to `given` if that is a mapping without a tag."""
+    """If `given` is a mapping without a tag, adds the tag of the type of `current`."""
     return {"_tag": f"!{type(current).__name__}", **given} if isinstance(given, dict) else given
 
 
 def _of_variants(given: object, current: Mapping[str, object]) -> object:
-    """Applies `_of_variant` to each value whose name is in `current`."""
+    """Applies `_of_variant` to each value of `given` and the value of that name in `current`, if
+    any."""
     if not isinstance(given, dict):
         return given
     return {
@@ -231,8 +232,8 @@ def _check_meaning(scenario: Scenario) -> None:
         )
     if -_PLAINLY_BELOW < scenario.heightmap.z_min < 0:
         raise ValueError(
-            f"heightmap.z_min is {scenario.heightmap.z_min:g}, so close below the table that it "
-            f"could be a calibration error: use 0, or -{_PLAINLY_BELOW:g} or less"
+            f"heightmap.z_min is {scenario.heightmap.z_min:g}, but points so little below the "
+            f"table may be calibration errors: use 0, or -{_PLAINLY_BELOW:g} or less"
         )
     if scenario.heightmap.z_max <= scenario.heightmap.z_min:
         raise ValueError(

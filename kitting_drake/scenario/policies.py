@@ -350,7 +350,7 @@ class _OfObservationAlone:
 
     function: Callable[[Observation], PickPlaceAction]
     forgets: bool = False
-    """Whether the function gets the observation without its history."""
+    """Whether the observation's `history` is emptied before the call."""
 
     def __call__(
         self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()
@@ -399,7 +399,7 @@ def _cluttered_table(site: PolicySite) -> ClutteredTable | None:
 
 
 def _ledge(scene: Scene) -> Ledge | None:
-    """The kit's block. Objects can be turned over across its edges. None if there is none."""
+    """The kit's block, over whose edges objects can be turned; None if the scene has no kit."""
     for item in scene.fixtures:
         if item.p_FPoints is not None:
             length, width, _ = np.ptp(item.p_FPoints, axis=0).tolist()

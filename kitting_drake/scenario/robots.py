@@ -82,9 +82,9 @@ class FrankaArm:
         away = float(np.linalg.norm(base - np.clip(base, lower, upper)))
         if away < FOOT:
             raise ValueError(
-                f"robot.base is {at}, but there the arm's foot stands in the workspace: keep it "
-                f"{FOOT:g} m away from the workspace, which is x {lower[0]:g} to {upper[0]:g} and "
-                f"y {lower[1]:g} to {upper[1]:g}"
+                f"robot.base is {at}, but there the arm's foot stands in the workspace: keep the "
+                f"base {FOOT:g} m away from the workspace, which is x {lower[0]:g} to {upper[0]:g} "
+                f"and y {lower[1]:g} to {upper[1]:g}"
             )
         on_table = np.linalg.norm(base - np.clip(base, *TABLE)) < FOOT
         if on_table and self.base[2] < 0:

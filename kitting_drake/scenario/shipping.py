@@ -50,7 +50,7 @@ def pack(chosen: ChosenScenario, folder: Path) -> Shipment:
     """
     scenario, base = chosen.scenario, chosen.base
     root = Path(kitting_drake.__file__).resolve().parents[1]
-    # A wheel carries its models inside the package.
+    # In an installed wheel, the models lie inside a package and are packed with it.
     shipped = [*_PACKAGES, *([MODELS.name] if MODELS.parent == root else [])]
     try:
         files = {

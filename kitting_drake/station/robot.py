@@ -136,7 +136,7 @@ def _add_arm(parser: Parser, plant: MultibodyPlant, robot: FrankaArm) -> None:
 
 def _add_pedestal(plant: MultibodyPlant, robot: FrankaArm) -> None:
     """Adds a visual pedestal for the arm, from the floor up to its base."""
-    # End just below the base, so that the table covers the pedestal.
+    # End 1 mm below the base, so that the table hides the top of a pedestal in it.
     height = robot.base[2] - 0.001 - _FLOOR
     if height <= 0:
         return
@@ -163,7 +163,7 @@ def _text(model: Path) -> str:
 
 
 def _without_axes(text: str) -> str:
-    """The floating hand's model without the axes that replace the arm."""
+    """Removes the axes x, y, z and yaw from the floating hand's model, for a hand on an arm."""
     root = ElementTree.fromstring(text)
     model = root.find("model")
     assert model is not None

@@ -97,8 +97,8 @@ def _check_dataclass(schema: Any, value: Any, where: str) -> None:
 
 
 def _check_struct(schema: Any, value: Any, where: str) -> None:
-    """Checks the names and the plain values of one of Drake's structs. Drake checks the other
-    values."""
+    """Checks one of Drake's structs: the names of its fields, and the values that are numbers,
+    booleans or strings. Drake checks the other values."""
     hints = struct_fields(schema) or {}
     if not isinstance(value, dict):
         raise ValueError(f"{where} must be a mapping, not {_shown(value)}")
