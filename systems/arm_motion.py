@@ -28,8 +28,8 @@ from systems.vector_view import Array, Number
 _KEPT = 8
 """Number of planned motions that are cached."""
 _FARTHEST_STOP = 0.02
-"""If a commanded stop is further than this from the hand's pose, in m, the arm brakes where it
-is."""
+"""The arm stops at a given pose or height only within this distance of the hand, in m. Otherwise it
+brakes where it is."""
 _SAME_HEIGHT = 0.003
 """A hand that is less than this below a height, in m, counts as having reached it."""
 
@@ -63,7 +63,8 @@ class ArmMotion(JawMotion):
 
     - `APPROACH`, `LIFT` with `CARRY`, `RETREAT`: motions in joint space, as fast as the joints'
       limits and the parameters' linear speed and acceleration allow. The hand rises straight up to
-      the clear height, travels above it, and sinks only near its goal. Corners are rounded.
+      the clear height (see `MotionHeights`), travels above it, and sinks only near its goal.
+      Corners are rounded.
     - `DESCEND`, `LOWER`, `SEARCH`: straight lines of the hand, with the parameters' speeds.
     - If a mode begins while the arm moves, the arm first brakes, as fast as the limits of
       acceleration and jerk allow. The exception is `CARRY` after `LIFT`: these two are one motion.
@@ -197,7 +198,7 @@ class ArmMotion(JawMotion):
         opening: float | None = None,
         at: NDArray[np.float64] | None = None,
     ) -> None:
-        """Starts a mode from the present commands. See `RobotMotion`."""
+        """Starts a mode from the motion that is commanded now. See `RobotMotion`."""
         assert isinstance(state, ArmState)
         goes_on = mode == Mode.CARRY and state.mode == Mode.LIFT
         now = self.motion_at(state, time)
@@ -297,7 +298,7 @@ class ArmMotion(JawMotion):
         Args:
             y: wanted y of the hand in the world, in m.
             now: (7) present joint positions, in rad.
-            surface: height of the surface below, in m.
+            surface: height of the highest surface around the hand, in m.
             z: height of the fingertips, in m; if None, the height at which the hand waits.
         """
         x, home_y, _, yaw = self._parameters.home
@@ -311,7 +312,7 @@ class ArmMotion(JawMotion):
         return self.home_joints
 
     def slow_down(self, state: PlannerState, time: float, share: float) -> None:
-        """Does nothing: the limits of an arm's joints apply. See `RobotMotion`."""
+        """Does nothing: an arm keeps its acceleration, whatever it holds. See `RobotMotion`."""
 
     def back_off(self, state: PlannerState, distance: float) -> None:
         """Raises the goal of the present mode. See `RobotMotion`."""

@@ -13,8 +13,8 @@ from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import PlanarPose
 
 _ROOM_ABOVE = 0.03
-"""How far above the clear height the arm must be able to rise, in m. Motions with rounded corners
-rise above the clear height."""
+"""How far above the clear height (see `MotionHeights`) the arm must be able to rise, in m. Motions
+with rounded corners rise above it."""
 
 
 def hand_stops(

@@ -57,7 +57,7 @@ class ReachMap:
         q7 = np.broadcast_to(joint_seven(_SWIVELS, 0.0), zero.shape)
         points = np.broadcast_to(tips[:, None, :], (*zero.shape, 3))
         found = inverse(points, q7, zero)
-        # At a swivel of zero the general solution is singular.
+        # At a swivel of zero `inverse` is singular, so use `planar`.
         middle = len(_SWIVELS) // 2
         found[:, middle] = planar(tips, q7[:, middle])[:, None, :]
         with np.errstate(invalid="ignore"):
@@ -65,7 +65,7 @@ class ReachMap:
         return np.asarray(inside[..., 1:6].all(-1)), found[..., 0]
 
     def shares(self, base: ArmBase, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Returns (n, m) the share of all yaws at which the hand can be at each point and height.
+        """Returns (n, m) the fraction of all yaws that the hand can have at each point and height.
 
         Args:
             base: pose of the arm's base in the world; its height is not used.

@@ -13,7 +13,7 @@ from systems.arm_inertia import ArmInertia
 from systems.arm_limits import JOINTS, ArmLimits
 
 _SHARE = 0.98
-"""Share of the limits of acceleration and jerk that a stop uses."""
+"""Fraction of the limits of acceleration and jerk that a stop uses."""
 _TRIES = 4
 """How many jerk limits are tried at most, until the rates of the torques are within their
 limits."""

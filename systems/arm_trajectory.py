@@ -65,9 +65,9 @@ class ArmTrajectory:
     start_width: float = 0.08
     """Opening between the pads at the start, in m."""
     limits_used: tuple[tuple[str, float], ...] = ()
-    """For each kind of limit, its name and the largest share of it that the motion uses, up to 1.
-    For positions the share is the distance from the middle of a joint's range, divided by half the
-    range."""
+    """For each kind of limit, its name and the largest fraction of it that the motion uses.
+    For positions the fraction is the distance from the middle of a joint's range, divided by half
+    the range."""
 
     @property
     def times(self) -> NDArray[np.float64]:
@@ -219,7 +219,7 @@ def plan_action(
 def limits_used(
     samples: NDArray[np.float64], limits: ArmLimits, rate: float
 ) -> tuple[tuple[str, float], ...]:
-    """The largest share of each limit that a motion uses.
+    """For each kind of limit, its name and the largest fraction of it that a motion uses.
 
     Args:
         samples: (n, 21) joint positions, velocities and accelerations at a constant rate, in rad

@@ -202,7 +202,7 @@ class ClutteredTable:
         slip."""
         if not _ON_EDGE < tilt(X_WB) < _UPSIDE_DOWN:
             return [(grasp, _gripper_pose(X_WB, grasp, steepest)) for grasp in self.grasps[index]]
-        # The jaws close along z of B, across the object's thickness.
+        # An object on its edge is gripped across its thickness: the jaws close along z of B.
         item = self.objects[index]
         z_axis = X_WB.rotation().matrix()[:, 2]
         theta = math.atan2(-z_axis[0], z_axis[1])

@@ -19,7 +19,8 @@ a force above the limit lasts longer than this: an impact is shorter, a jam is l
 _WEIGHINGS = 16
 """The payload is averaged over about this many samples."""
 _CLEAR = 0.001
-"""The payload is weighed while the hand is at most this far below the travel height, in m."""
+"""The payload is weighed while the hand is at most this far below the travel height (see
+`MotionHeights`), in m."""
 
 _UNWEIGHED = (Mode.LIFT, Mode.CARRY)
 """The modes in which an object of unknown weight may be in the hand."""

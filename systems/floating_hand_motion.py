@@ -24,12 +24,13 @@ from systems.planner_state import YAW, PlannerState, X, Y, Z
 YAW_LIMIT = 3.4
 """Largest yaw of the wrist in either direction, in rad; slightly less than its joint limit."""
 _NEARLY_THERE = 0.02
-"""Within this horizontal distance of its goal, in m, the hand may sink below the clear height."""
+"""Within this horizontal distance of its goal, in m, the hand may sink below the height at which it
+crosses the table."""
 TRIAL = 0.010
 """How far an object is lifted for a trial of the grasp, in m: just clear of the table."""
 _OVERSHOOT = 0.05
-"""How far above the travel height the goal of a lift is, in m, so that the hand passes that height
-without a stop."""
+"""The goal of a lift is this far above the travel height (see `MotionHeights`), in m, so that the
+hand does not stop there."""
 _HOLDING = (Mode.LIFT, Mode.CARRY, Mode.LOWER, Mode.SEARCH)
 """The modes in which an object is in the hand."""
 
@@ -76,7 +77,7 @@ class HandMotion(JawMotion):
         opening: float | None = None,
         at: NDArray[np.float64] | None = None,
     ) -> None:
-        """Starts a mode from the present commands. See `RobotMotion`."""
+        """Starts a mode from the motion that is commanded now. See `RobotMotion`."""
         now, rate, _ = np.split(self.motion_at(state, time), 3)
         if z is not None:
             now[2] = z
@@ -194,7 +195,7 @@ class HandMotion(JawMotion):
         )
 
     def slow_down(self, state: PlannerState, time: float, share: float) -> None:
-        """Goes on with less acceleration. See `RobotMotion`."""
+        """Continues the present motion with less acceleration. See `RobotMotion`."""
         now, rate, _ = np.split(self.motion_at(state, time), 3)
         opening, _ = self.opening_at(state, time)
         state.start_opening = state.goal_opening = opening

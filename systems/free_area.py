@@ -20,8 +20,8 @@ _LEAST = 0.010
 _AMPLE = 0.060
 """Clearance beyond this, in metres, has no benefit: the open hand already has room."""
 _WAY = 0.02
-"""A position that is one metre farther away is preferred only if its clearance is larger by this,
-in metres."""
+"""A position one metre farther from the wanted point is preferred only if its clearance is larger
+by this, in metres."""
 
 
 def find_free_pose(
@@ -32,7 +32,7 @@ def find_free_pose(
     near: NDArray[np.float64],
     yaw: float,
 ) -> PlanarPose | None:
-    """The pose in the world at which an object has the most clearance; None if it fits nowhere.
+    """Finds a pose in the world at which an object has much clearance; None if it fits nowhere.
 
     Args:
         outline: (k, 2) points that cover the object, in its frame, in metres.

@@ -101,7 +101,7 @@ def soft_force(
     soft = min(_SOFT, _SOFT_SHARE * width)
     most = max(peak * (soft / max(sunk, soft)) ** 2, parameters.grasp_force)
     if most > _MUCH_LESS * present:
-        # Do not lower the force for so little, because each change restarts its ramp.
+        # Ignore a small decrease, because each change restarts the ramp of the force.
         most = max(most, present)
     return min(force, most)
 
@@ -109,7 +109,7 @@ def soft_force(
 def gentleness(
     weight: float, moment: float, present: float, parameters: PickPlaceParameters
 ) -> float:
-    """The share of the acceleration limits with which an object of a given weight is moved.
+    """The fraction of the acceleration limits that is used to move an object of a given weight.
 
     It is inversely proportional to the weight above `heavy_load`, and at most a half if the object
     may turn between the pads. It never rises while the object is held.

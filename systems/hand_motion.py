@@ -68,7 +68,7 @@ def blended_legs(
         length, speed = abs(ways[index]) + left, speeds[index]
         left = 0.0
         if following is not None:
-            # Distance that the next leg covers until this leg has stopped.
+            # Shorten this leg by the distance that the next leg covers while this leg brakes.
             stopping = min(speed, math.sqrt(length * acceleration)) / acceleration + SMOOTHING
             ahead = travel(abs(ways[following]), speeds[following], acceleration, stopping)
             left = min(ahead[0], length)
@@ -127,7 +127,7 @@ def travel_time(distance: float, speed: float, acceleration: float) -> float:
 
 
 def time_to_reach(part: float, distance: float, speed: float, acceleration: float) -> float:
-    """Time after which `travel` has covered `part` of its distance, in s."""
+    """Time after which `travel` has covered the first `part` metres or radians, in s."""
     low, high = 0.0, travel_time(distance, speed, acceleration)
     if part >= distance:
         return high

@@ -15,7 +15,8 @@ _SPIRAL = tuple(
 """The position offsets (x, y) that the search tries next, an even spiral from the middle, as
 fractions of `reach`."""
 _LEAST_RIM = 0.004
-"""Least height of a cavity's rim above the table, in metres. It exceeds the noise of o_t."""
+"""Least height of a cavity's rim above the table, in metres. It exceeds the noise of heights in
+the observation o_t."""
 _BACK = (0.0, 0.0)
 """The last offset, which returns to the start of the search."""
 

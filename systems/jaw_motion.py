@@ -11,8 +11,8 @@ class JawMotion:
     """Computes jaw openings and closing forces in all modes from the planner's state."""
 
     settles = math.inf
-    """Infinite, so that `tare_settle` alone sets how long the hand comes to rest; see
-    `RobotMotion`."""
+    """Infinite, so that `tare_settle` alone sets how long the hand rests before the payload is
+    tared; see `RobotMotion`."""
 
     def __init__(self, parameters: PickPlaceParameters) -> None:
         """
@@ -83,8 +83,8 @@ class JawMotion:
         return float(state.start_force + fraction * (state.goal_force - state.start_force))
 
     def jaws_arrival(self, state: PlannerState, moved: float) -> float:
-        """The time, in s, at which the present mode's motion and force of the jaws are complete, or
-        `moved` if that is later."""
+        """The time, in s, at which the hand, the jaws and their force have all reached the present
+        mode's goals. `moved` is this time for the hand alone."""
         opening_time = abs(state.goal_opening - state.start_opening) / (
             2 * self._parameters.finger_speed
         )

@@ -1,4 +1,4 @@
-"""Measures the width of an object between the jaws from o_t."""
+"""Measures the width of an object between the jaws from the observation o_t."""
 
 from __future__ import annotations
 

@@ -92,7 +92,7 @@ class Ledge:
                 delta = others[:, :2] - edge
                 u, v = delta @ along, delta @ normal
                 count = int(((np.abs(u) < length / 2 + _ROOM) & (v > -0.05) & (v < _LANDING)).sum())
-                # If the object lies beside this edge, it was probably released here before.
+                # An object beside this edge was probably released here before: prefer other edges.
                 again = bool(np.linalg.norm(p_WCenter[:2] - edge) < _LANDING)
                 if best is None or (count, again) < best[0]:
                     p_W = edge + outside * normal
@@ -102,8 +102,8 @@ class Ledge:
 
 
 def _inside(outline: NDArray[np.float64]) -> float:
-    """How far an object reaches to the left of its centre of mass, in metres. The reach is measured
-    before and behind the centre of mass, and the smaller value is returned."""
+    """How far an object reaches to the left of its centre of mass, in metres. Of the
+    reaches ahead of and behind the centre of mass, the smaller one is returned."""
     u, v = outline.T
     reach = u.max() - u.min()
     sides = [(sign * u > _BESIDE) & (sign * u < 0.3 * reach) for sign in (-1, 1)]

@@ -1,4 +1,5 @@
-"""Computes the fingertip heights of one pick and place from the surface heights in o_t."""
+"""Computes the fingertip heights of one pick and place from the surface heights in the observation
+o_t."""
 
 from __future__ import annotations
 

@@ -105,7 +105,8 @@ class OraclePolicy(LeafSystem):
        already have a misplaced object come last. Objects that were tried before come after the
        others, so that a tool that slips does not use up all actions.
     2. The object: of those that may fill the goal and fill no other, the highest one, since nothing
-       lies on it. Of equally high ones, the one that `evaluate_placements` assigned.
+       lies on it. Of equally high ones, the one that `evaluate_placements` assigned to the
+       goal.
     3. The goal pose: of the goal's unoccupied poses, the one that rotates the object least.
     4. The grasp: of those that keep the fingers clear of other objects at the pick and the place,
        the one that was tried least often. So after a slip the oracle tries another grasp.

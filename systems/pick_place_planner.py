@@ -164,7 +164,7 @@ class PickPlacePlanner(LeafSystem):
         search_steps = parameters.search.steps if insertion else 0
         self._steps = PickPlaceSteps(parameters, self._motion, self._guard, search_steps)
         self._period = period
-        # When two events are due at the same time, Drake handles them in the order of declaration.
+        # Declare `_feel` first: Drake handles simultaneous events in the order of declaration.
         self.DeclarePeriodicDiscreteUpdateEvent(force_period, 0.0, self._feel)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 

@@ -116,11 +116,11 @@ class PickPlaceSteps:
         following = Mode.RELEASE if holds else Mode.RETREAT
         self._motion.begin(state, following, moment.time, at=moment.hand[:4])
         if retreats:
-            # The jaws drag something along, so open them fully.
+            # A force during the retreat means that the jaws drag something: open them fully.
             state.goal_opening = self._parameters.open_width
 
     def follow(self, moment: Moment) -> None:
-        """Begins the next mode when the motion of the present one has arrived."""
+        """Begins the next mode when the motion of the present mode is complete."""
         state, time = moment.state, moment.time
         if time >= self._motion.arrival(state):
             following = Mode.OBSERVE if state.mode == Mode.RETREAT else Mode(int(state.mode) + 1)
@@ -140,7 +140,7 @@ class PickPlaceSteps:
                 self._motion.begin(state, Mode.RETREAT, time)
         elif contact[2] > self._parameters.contact_threshold:
             self._motion.begin(state, Mode.CLOSE, time, z=hand[2])
-            # Back off a little: the jaws cannot close while the fingertips press.
+            # Rise a little: the jaws cannot close while the fingertips press on a surface.
             self._motion.back_off(state, self._parameters.floor_clearance)
         elif time >= self._motion.arrival(state):
             self._motion.begin(state, Mode.CLOSE, time)

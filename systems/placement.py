@@ -25,7 +25,7 @@ STRICT_HEIGHT = 0.002
 STRICT_ANGLE = math.radians(20.0)
 """Largest heading error of a strict success, modulo the object's symmetry, in radians."""
 ALL = 1 - 1e-9
-"""A share or a reward above this counts as 1."""
+"""A share or a reward above this counts as 1, to allow for rounding."""
 
 GONE = 10.0
 """An object at least this far from the world's origin, in metres, has left the cell or has not
@@ -127,8 +127,8 @@ class Placement:
     goal's (x, y) plane, in metres. All errors are measured in the goal's frame, which is tilted
     with a tilted cavity."""
     angle_error: float = math.inf
-    """Heading error about world z, modulo the object's symmetry, in radians; zero if the goal
-    accepts any heading."""
+    """Heading error about the goal's z axis, modulo the object's symmetry, in radians; zero if the
+    goal accepts any heading."""
     height_error: float = math.inf
     """Height of the object's middle above its goal, in metres."""
     share: float = 0.0

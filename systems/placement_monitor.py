@@ -53,7 +53,7 @@ class PlacementMonitor(LeafSystem):
       `evaluate_placements`.
     - `reward` (1): the sum of the goals' rewards, each multiplied by its earned share.
     - `success` (n): 1 for an object that fills its goal, else 0.
-    - `add_s` (n): equation 9, metres; infinite for an object without a goal.
+    - `add_s` (n): ADD-S, equation 9 of the paper, in metres; infinite for an object without a goal.
     - `position_error`, `angle_error`, `height_error` (n): see `Placement`; metres, radians.
     - `kept_goals` (one element for each goal): 1 for goals of a stage that was complete when an
       action began, else 0. They count as filled from then on (see `complete_stages`).

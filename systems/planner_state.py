@@ -63,7 +63,8 @@ class PlannerState(VectorView):
     held_width = Number()
     """The opening of the jaws when they had gripped, in m."""
     gentleness = Number()
-    """The share of the acceleration limits with which the held object is moved; 0 stands for 1."""
+    """The fraction of the acceleration limits that is used to move the held object; 0 stands for
+    1."""
     search_step = Number()
     payload = Number()
     """The vertical force of the payload on the hand, in N; negative or zero."""
@@ -100,8 +101,8 @@ class PlannerState(VectorView):
     """Position of the object's centre of mass relative to the pads' middle, along the pads, in m.
     It is recorded in the history if the object is set down again."""
     trial_weight = Number()
-    """The largest weight felt in the trial lift, in N: that when the table bears the least of the
-    object's weight."""
+    """The largest weight felt in the trial lift, in N. It is felt when the table bears least of the
+    object."""
     doubts_grip = Number()
     """1 during a trial lift of an object that may turn between the pads, else 0."""
     trusts_grip = Number()

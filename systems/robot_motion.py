@@ -51,7 +51,7 @@ class RobotMotion(Protocol):
         opening: float | None = None,
         at: NDArray[np.float64] | None = None,
     ) -> None:
-        """Starts a mode from the present commands.
+        """Starts a mode from the motion that is commanded now.
 
         Args:
             state: the planner's state; modified.
@@ -66,12 +66,12 @@ class RobotMotion(Protocol):
         """Raises the goal of the present mode, a straight line of the hand, by a distance."""
 
     def slow_down(self, state: PlannerState, time: float, share: float) -> None:
-        """Goes on with less acceleration, in this mode and in later ones that move the object.
+        """Continues with less acceleration, in this mode and in later ones that move the object.
 
         Args:
             state: the planner's state; modified.
             time: the present time.
-            share: the share of the acceleration limits that the motion may use.
+            share: the fraction of the acceleration limits that the motion may use.
         """
 
     def motion_at(self, state: PlannerState, time: float) -> NDArray[np.float64]:

@@ -37,8 +37,8 @@ class SensorNoiseParameters:
     """Imperfections of the RGB-D cameras and their calibration. The defaults describe perfect
     cameras."""
 
-    # Standard deviation of the depth at 1 m, in m. It grows with the square of the depth, as for a
-    # stereo camera.
+    # Standard deviation of the depth's noise at 1 m, in m. It grows with the square of the depth,
+    # as for a stereo camera.
     depth_std: float = bounded(0.0, 0.0, 0.1)
 
     # Correlation length of the depth noise: radius of the smoothing kernel, in pixels.

@@ -181,7 +181,7 @@ def _fill_shadows(filled: NDArray[np.float32], shadows: NDArray[np.bool_]) -> No
     seen = filled.copy()
     labels, _ = ndimage.label(shadows, np.ones((3, 3), bool))
     for label, place in enumerate(ndimage.find_objects(labels), 1):
-        # Narrow gaps may separate a shadow from the nearest seen pixels, so look further.
+        # Look two pixels beyond a shadow, because narrow gaps may surround it.
         rows, cols = (slice(max(part.start - 2, 0), part.stop + 2) for part in place)
         shadow, around = labels[rows, cols] == label, seen[rows, cols]
         border = ndimage.binary_dilation(shadow, _SHADOW, iterations=2) & np.isfinite(around)
@@ -200,9 +200,9 @@ class PlanarPose:
     """
 
     x: float = 0.0
-    """World x of the tool centre point, in metres."""
+    """World x of the point midway between the fingertips, in metres."""
     y: float = 0.0
-    """World y of the tool centre point, in metres."""
+    """World y of the point midway between the fingertips, in metres."""
     theta: float = 0.0
     """Rotation about world +z, in radians."""
 
@@ -297,10 +297,16 @@ class LeftOver:
 
 
 OUTCOMES = ("placed", "missed", "dropped", "pressed", "stopped", "set down", "unreachable")
-"""The outcomes of an action: the object was let go at its place, nothing was grasped, the object
-was lost on the way, it was pressed down, a contact force above the limit ended the action, the
-object was set down at the pick because it would have turned between the pads, or the robot did not
-move because it cannot reach the poses."""
+"""The outcomes of an action:
+
+- placed: the object was let go at its place.
+- missed: nothing was grasped.
+- dropped: the object was lost on the way.
+- pressed: the object was pressed down.
+- stopped: a contact force above the limit ended the action.
+- set down: the object was set down at the pick, because it would have turned between the pads.
+- unreachable: the robot did not move, because it cannot reach the poses.
+"""
 
 
 @dataclass(frozen=True)

@@ -53,7 +53,8 @@ class PoseWithin:
 
 @dataclass(frozen=True)
 class InZone:
-    """Success as in the Ravens tasks with zones: the share of an object's volume inside a box."""
+    """Success as in the Ravens tasks with zones: an object earns the share of its volume that lies
+    in a box."""
 
     X_WZone: RigidTransform
     """The zone's frame, with its origin at the middle of the zone's bottom."""

@@ -1,4 +1,4 @@
-"""Reads off o_t the surface heights that limit the motion of a pick and place."""
+"""Reads off the observation o_t the surface heights that limit the motion of a pick and place."""
 
 from typing import Any
 
@@ -43,8 +43,8 @@ estimate in standard deviations of the noise."""
 _SUNK = 0.003
 """A table that looks lower than expected by more than this, in metres, is assumed to be lower."""
 _TILT_DOUBT, _MOST_DOUBT = 0.3, 0.0025
-"""The uncertainty of heights after levelling is a share `_TILT_DOUBT` of the table's deviation, but
-at most `_MOST_DOUBT`, in metres."""
+"""The uncertainty of heights after levelling is `_TILT_DOUBT` times the table's deviation, but at
+most `_MOST_DOUBT`, in metres."""
 
 
 def read_surface_heights(
@@ -140,7 +140,7 @@ def _noise(height: NDArray[np.float32]) -> float:
     away = np.abs(height - ndimage.uniform_filter(height, _SMOOTHED, mode="nearest"))
     highest = ndimage.maximum_filter(height, _SMOOTHED, mode="nearest")
     flat = highest - ndimage.minimum_filter(height, _SMOOTHED, mode="nearest") < _FLAT
-    # Flat squares have less noise than average, so use them only to decide whether there is any.
+    # Flat squares have less noise than average, so use them only to decide whether there is noise.
     if flat.sum() >= _LEAST_FLAT and 1.4826 * np.median(away[flat]) < _CLEAN:
         return 0.0
     noise = 1.4826 * float(np.median(away))

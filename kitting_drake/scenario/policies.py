@@ -250,7 +250,7 @@ class Learned(PolicyConfig):
             **{key: file.card.get(key) for key in _TOLD},
             "training_seed": file.card.get("seed"),
             "angle_only": file.card.get("angle_only", False),
-            # The training step of the chosen checkpoint.
+            # The training step of the checkpoint that was best in validation.
             "checkpoint_step": (file.card.get("validation") or {}).get("step"),
         }
 

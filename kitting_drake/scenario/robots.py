@@ -56,7 +56,7 @@ class FrankaArm:
 
     # The hand waits at planner.home, but no higher than this, in m. At the default height the hand
     # hides at most 11 mm of the workspace's border from one of the default cameras. This height is
-    # above the largest one in o_t, 0.28 m.
+    # above the highest point that the observation o_t can show, at 0.28 m (heightmap.z_max).
     highest_wait: float = bounded(0.31, 0.0, 2.0)
 
     # Standard deviation of the noise of the external joint torques, in N m, from which the arm

@@ -37,7 +37,7 @@ def hidden_table_note(scenario: Scenario) -> str | None:
     """Returns a warning if no camera looks at the workspace, or if the waiting robot hides part of
     it from a camera; else None.
 
-    Unless another camera sees the hidden part, it is a hole in o_t.
+    Unless another camera sees the hidden part, it is a hole in the observation o_t.
 
     Raises:
         ValueError: an arm cannot reach the home pose.
