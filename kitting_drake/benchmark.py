@@ -274,7 +274,7 @@ def _duration(text: str) -> float:
     return duration
 
 
-# Each benchmark imports its modules lazily.
+# Each benchmark imports its modules lazily, so that only those of NAME are loaded.
 
 
 def _simulation(arguments: argparse.Namespace, console: Console, folder: Path) -> list[Table]:

@@ -158,8 +158,8 @@ def _add_export_flags(parser: argparse.ArgumentParser) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class _Export:
-    """The export of frames: each demonstration's frames go to `frames/`, and the LeRobot dataset
-    made of them to `lerobot/`."""
+    """Exports the demonstrations' frames to `frames/`, and a LeRobot dataset made of them to
+    `lerobot/`."""
 
     folder: Path
     frames: Path

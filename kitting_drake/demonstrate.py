@@ -54,7 +54,7 @@ def main() -> int:
 def _annotate(folder: Path, calibration: Calibration, port: int) -> None:
     steps = [step for steps in find_demonstrations(folder) for step in steps]
     with AnnotationServer(steps, calibration, port) as server:
-        # Print the address even with --quiet.
+        # Print the address even with --quiet, because the user must open it.
         print(
             f"annotate at {server.url}; Ctrl-C ends the server, and keeps the saved actions",
             flush=True,

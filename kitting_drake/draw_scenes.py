@@ -163,7 +163,7 @@ class _Parts:
             self._counts[batch] = outcome
 
     def _drawn(self) -> int:
-        """The number of scenes, including those of unfinished batches."""
+        """The number of scenes drawn so far, including those of unfinished batches."""
         unfinished = 0
         for path in self._folder.glob(f"*{_DRAWN}"):
             # Ignore errors: the process that writes the file may have just removed or truncated it.

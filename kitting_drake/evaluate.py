@@ -112,7 +112,7 @@ class Evaluation:
     episodes: list[Episode]
     """The episodes in the order of the seeds."""
     wall_seconds_total: float
-    """The total wall-clock time of all commands that ran episodes in the folder, in s."""
+    """The total wall-clock time of all commands that ran episodes for the output folder, in s."""
 
 
 def evaluate(

@@ -96,7 +96,8 @@ def _settings(
         learning_rate=arguments.learning_rate,
         decay=arguments.decay,
         taken_only=arguments.taken_only or not assumed.later_picks_possible,
-        # Curvature augmentation bends crops, but the Transporter rotates whole images.
+        # Curvature augmentation bends crops. The Transporter rotates whole images, so it is
+        # trained without.
         rigid=arguments.rigid or not assumed.curvature or arguments.method == "transporter",
         reflection=assumed.reflection and not arguments.rigid,
         colour=learned.colour if begun is None else begun.colour,
@@ -330,7 +331,7 @@ def _split(
     """Returns the training and the validation data."""
     everything = read_training_data(path)
     total = everything.count
-    # Keep for validation a tenth of a given count; without a count, keep all that are left.
+    # Validate on a tenth of a given count; without a count, on all data after the training data.
     most_kept = total if count is None else max(1, count // 10)
     if count is None:
         count = total if validation else _most_unrelated(everything, total - max(1, total // 11))

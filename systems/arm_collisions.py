@@ -59,7 +59,7 @@ among the objects."""
 _OUTER = (_FOREARM, _WRIST, _LAST, _HAND)
 """The links that could hit the arm's own base."""
 _LEAST = 0.01
-"""Distances below this value, in m, count as collisions."""
+"""A capsule closer than this to something else, in m, counts as colliding."""
 _POINTS = 7
 """Number of cross sections of a capsule on which `link_points` places points."""
 

@@ -28,11 +28,11 @@ class VelocityEnvelope:
     """
 
     lower: _Seven
-    """Lower end q_min of each joint's range in this formula, in rad."""
+    """Lower end q_min of each joint's range in the class's formula, in rad."""
     upper: _Seven
-    """Upper end q_max of each joint's range in this formula, in rad."""
+    """Upper end q_max of each joint's range in the class's formula, in rad."""
     offset: _Seven
-    """The offset that the formula subtracts for each joint, in rad/s."""
+    """The offset that the class's formula subtracts for each joint, in rad/s."""
     deceleration: _Seven
     """The deceleration d of each joint, in rad/s^2."""
 

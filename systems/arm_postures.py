@@ -30,7 +30,7 @@ defines the swivel."""
 _CHECKED = 12
 """Number of points of a path that are checked for collisions."""
 _JUMP = 1.5
-"""Largest allowed change of a joint on a straight line up or down, in rad."""
+"""Largest allowed change of a joint while the hand moves straight up or down, in rad."""
 _TILTS = (math.radians(2.0), math.radians(20.0), math.pi)
 """Limits of the hand's tilt between two stops, in rad. The smallest one that allows a motion is
 used, because one end of a long object hangs lower if the hand tilts."""
@@ -118,8 +118,8 @@ class ArmPostures:
     def choose(
         self, stops: Sequence[HandStop], now: NDArray[np.float64]
     ) -> tuple[list[NDArray[np.float64]], str]:
-        """Chooses a posture at the height `high` of each stop, so that the whole motion is short
-        and the hand tilts as little as possible between two stops.
+        """Chooses a posture at the height `high` of each stop. The whole motion is kept short, and
+        the hand tilts as little as possible between two stops.
 
         The jaws are symmetric, so the yaws may be turned by pi, but only at all stops together.
 
@@ -173,7 +173,7 @@ class ArmPostures:
         best: list[NDArray[np.float64]] = []
         least = math.inf
         for half_turn in (0, 1):
-            # Times and postures of the fastest ways that reach the options of the latest stop.
+            # For each option of the latest stop: time and postures of the fastest way there.
             ways = [(0.0, [now])]
             for found in options:
                 following = []
@@ -288,7 +288,7 @@ class ArmPostures:
             return f"for {where} the arm would collide with {touched[0]}"
         if found:
             return f"the arm cannot lower its hand in a straight line to {where}"
-        # The yaw affects only joint 7. If the arm reaches another yaw, the fault is joint 7's.
+        # The yaw affects only joint 7: if another yaw is in reach, joint 7 is out of its range.
         if reached(*np.linspace(0.0, math.pi, 5)[:-1].tolist()):
             return f"{where} would take joint 7 out of its range"
         heights = f"between {stop.low:.3f} and {stop.high:.3f} m"

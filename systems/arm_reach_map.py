@@ -18,9 +18,9 @@ _SWIVELS = np.arange(-31, 32) / 10
 """The swivels that are tried, in rad: angles of the wrist to the vertical plane through base and
 hand, as in `systems.arm_postures`."""
 _STEP = 0.005
-"""Distance between the radii whose postures are computed, in m."""
+"""Spacing of the hand's distances from the base's axis for which postures are computed, in m."""
 _FARTHEST = 1.0
-"""Largest radius whose postures are computed, in m."""
+"""Largest distance of the hand from the base's axis for which postures are computed, in m."""
 _CHUNK = 256
 
 

@@ -136,7 +136,7 @@ def quintic(
         step: time between the points, in s.
         since: time since the first point at which to evaluate, in s.
     """
-    # Subtract the parabola that continues the motion at the first point. The rest is a polynomial
+    # Subtract the parabola that continues the motion from the first point. The rest is a polynomial
     # in since / step with powers 3 to 5.
     h = step
     first = q[1] - q[0] - h * v[0] - h * h / 2 * a[0]

@@ -74,8 +74,8 @@ class WayVector(VectorView):
     sink = Number()
     """Height to which the hand sinks at the end of a path that crosses."""
     reach = Number()
-    """How far a held object reaches to the side of the fingertips. Its end hangs lower if the hand
-    tilts."""
+    """How far a held object reaches to the side of the fingertips. The object's end hangs lower if
+    the hand tilts."""
     speed = Number()
     """Highest linear speed of the hand on a path that crosses. `acceleration` is the highest linear
     acceleration on any path."""
@@ -258,8 +258,8 @@ class ArmWay:
         return below if len(below) > 1 else above[-1:]
 
     def _missing(self, path: _Path, clear: float, reach: float) -> float:
-        """How far, in m, the hand or its object sinks below the clear height between start and end;
-        not positive if neither does."""
+        """How far, in m, the hand or the held object sinks below the clear height between start and
+        end; zero or less if neither does."""
         tips, low = path.tips, path.tips[:, 2]
         if path.points[:, [2, 4]].any():
             low = low - _reach_below(path.points, reach)
@@ -285,7 +285,7 @@ class ArmWay:
 
 
 def _reach_below(q: NDArray[np.float64], reach: float) -> NDArray[np.float64]:
-    """(n) how far, in m, the tilted hand or its object reaches below the point between the
+    """(n) how far, in m, the tilted hand or the held object reaches below the point between the
     fingertips.
 
     Args:

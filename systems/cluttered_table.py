@@ -34,14 +34,14 @@ _ABOVE = 0.002
 """In a square, an object counts as above another object if its lowest point is at most this far, in
 metres, below the other object's highest point."""
 _LEAST_SQUARES = 2
-"""An object lies on another object if it counts as above it in at least this many squares."""
+"""An object lies on another one if it counts as above the other in at least this many squares."""
 _FLAT = math.radians(2.5)
 """An object tilted by less than this, in radians, lies flat."""
 _SAME_SHAPE = 0.0003
-"""Two surfaces count as equal if the mean distance between their points exceeds the points' spacing
-by less than this, in metres."""
+"""Two surfaces count as equal if the mean distance between their points exceeds 1.1 times the
+points' spacing by less than this, in metres."""
 _ROLLED = math.radians(20.0)
-"""A tilt below this, in radians, does not count as caused by rolling."""
+"""Only a tilt of at least this, in radians, counts as caused by rolling."""
 _ROLLED_PITCH = math.radians(10.0)
 """The axis about which a round object rolls is assumed to deviate by less than this, in radians,
 from x of its frame B."""
@@ -85,8 +85,8 @@ class HeldFromAbove:
         """The surface heights that the planner needs for this grasp.
 
         Args:
-            highest: world z of the highest surface, in metres.
-            rim: world z of the rim of the place, in metres; 0 for the table.
+            highest: world z of the highest surface in the workspace, in metres.
+            rim: world z of the rim around the place, in metres; 0 for a place on the table.
         """
         # Add how far the object reaches below its gripped part.
         highest += self.bottom - self.lowest

@@ -15,7 +15,7 @@ HEAVIEST = 3.0
 """Largest payload of a Franka arm, in kg. A stronger pull is not the weight of an object."""
 _LASTING = 1 / 64
 """Peak forces are means over this time, in s. In modes that expect contact, the guard acts only if
-a force above the limit lasts longer than this: an impact is shorter, a jam is longer."""
+a force above the limit lasts longer than this. An impact is shorter, a jam is longer."""
 _WEIGHINGS = 16
 """The payload is averaged over about this many samples."""
 _CLEAR = 0.001

@@ -16,8 +16,8 @@ _MOMENT_ARM = 0.0030
 """While the hand accelerates, the pads hold a moment up to their force times this length, in m. A
 long round handle begins to turn if the moment exceeds the force times 5 mm."""
 _HELD_MOMENT = 0.30
-"""An object that does not turn between the pads at rest does not turn in motion either if its
-moment is below this, in N m."""
+"""If an object with a smaller moment, in N m, does not turn between the pads at rest, it will not
+turn in motion."""
 _NOTABLE_MOMENT = 0.10
 """A moment that a poor grip might not hold, in N m."""
 _INDULGENCE = 0.5
@@ -26,16 +26,17 @@ value."""
 _LONGEST_LEVER = 0.12
 """Largest plausible distance of a centre of mass from the pads' middle, in m."""
 _SOFT, _SOFT_SHARE = 0.006, 0.2
-"""If the jaws sink farther into an object than this, in m, or than this share of its width, they
-press less."""
+"""If the jaws sink farther into an object than `_SOFT`, in m, or than `_SOFT_SHARE` of its width,
+they press less."""
 _MUCH_LESS = 0.85
-"""The force on an object into which the jaws sink is lowered only if the new force is at most this
-share of the present one."""
+"""If the jaws sink into an object, their force is lowered only to at most this fraction of the
+present force."""
 _GENTLE, _GENTLEST = 0.5, 0.25
 """Fractions of the acceleration limits. An object that may turn is moved with at most `_GENTLE` of
 them; no object is moved with less than `_GENTLEST` of them."""
 _GENTLER = 0.8
-"""A motion is restarted when its acceleration should be less than this share of the present one."""
+"""A motion is restarted when its acceleration should be less than this fraction of the present
+one."""
 _LEAST_CHANGE = 1.05
 """The force rises only in steps of at least this factor, so that noise does not restart its
 ramp."""

@@ -31,7 +31,8 @@ JOINT_LIMITS = {"x": (-1.0, 1.5), "y": (-1.5, 1.5), "z": (-0.05, 1.2), "yaw": (-
 
 
 def check_reach(action: PickPlaceAction) -> None:
-    """Checks that the hand can reach an action's pick and, unless it presses, its place.
+    """Checks that the hand can reach an action's pick and, unless the action presses, its
+    place.
 
     Raises:
         RuntimeError: a pose is not finite or out of reach.

@@ -145,7 +145,7 @@ def _see(view: View, grid: PixelGrid) -> NDArray[np.float32]:
     ends = view.X_WD[:3, :3].T + p_WD
     origin = np.append(grid.to_pixel(p_WD[:2]), p_WD[2] - grid.z_min)
     axes = np.column_stack([grid.to_pixel(ends[:, :2]), ends[:, 2] - grid.z_min]) - origin
-    origin[:2] += 0.5  # Truncation then finds the nearest pixel centre.
+    origin[:2] += 0.5  # After this shift, truncation finds the nearest pixel centre.
 
     def coordinate(k: int) -> NDArray[np.float32]:
         a, b, c = (np.float32(value) for value in axes[:, k])

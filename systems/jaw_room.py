@@ -11,8 +11,8 @@ from systems.hand_geometry import FINGER_LENGTH, FINGERTIP_DEPTH, MAX_OPENING
 from systems.signals import PixelGrid, PlanarPose
 
 _LEVEL = 0.3
-"""The width is measured at this share of the object's height, which is below where the pads
-grip."""
+"""The width is measured at this fraction of the object's height above its support, below where the
+pads grip."""
 _ROOM = 0.005
 """Clearance between object and finger that must also be free, in m."""
 _LINES = 7

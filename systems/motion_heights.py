@@ -28,7 +28,7 @@ class MotionHeights:
 def motion_heights(heights: SurfaceHeights, parameters: PickPlaceParameters) -> MotionHeights:
     """Computes the heights of a motion.
 
-    The fingertips grip a share of the object's height below its top, within limits, and stay above
+    The fingertips go below the object's top by a share of its height, within limits, and stay above
     the table. The object's bottom hangs as far below the fingertips as its support was below them
     at the pick.
 

@@ -333,6 +333,6 @@ class PickPlaceSteps:
         return left and search.is_on_rim(float(bottom), rim, table)
 
     def _is_held(self, hand: NDArray[np.float64], contact: NDArray[np.float64]) -> bool:
-        # Contact pushes the fingers apart, along their positive axes.
+        # A held object pushes the fingers apart, along their positive axes.
         pressed = contact[4:6].min() > self._parameters.grasp_force / 2
         return bool(pressed and hand[4] + hand[5] > self._parameters.minimum_width)

@@ -32,8 +32,7 @@ GONE = 10.0
 appeared yet."""
 
 _FAR = 0.5
-"""Upper limit of the displacements that are compared when objects are assigned to goals, in
-metres."""
+"""Larger displacements, in metres, count as this one when objects are assigned to goals."""
 _NEAR = 0.05
 """Only an object within this distance of a goal is tested for filling it, in metres."""
 _FREE_ANGLES = 24
@@ -65,9 +64,9 @@ class PlacedObject:
 
     @cached_property
     def p_BMiddle(self) -> NDArray[np.float64]:
-        """(3,) the point in B that is used to compare positions: the middle of the points' bounding
-        box, or the point of the same height on the `axis`. Unlike the origin of B, it lies on the
-        axis of a round object and does not move as the object rolls in place."""
+        """(3,) the point in B that is used to compare positions. It is the middle of the points'
+        bounding box, or the point of the same height on the `axis`. Unlike the origin of B, it
+        lies on the axis of a round object and does not move as the object rolls in place."""
         middle = (self.p_BPoints.min(axis=0) + self.p_BPoints.max(axis=0)) / 2
         return middle if self.axis is None else np.array([*self.axis, middle[2]])
 
@@ -358,7 +357,7 @@ def complete_stages(
     goals: Sequence[Goal], placements: Sequence[Placement], kept: Set[int] = frozenset()
 ) -> frozenset[int]:
     """Finds the goals of all stages that are or were complete. A stage is the set of goals that are
-    prerequisites of one other goal; it is complete when all of them are filled at the same time.
+    prerequisites of one other goal. It is complete when all of them are filled at the same time.
 
     As in the Ravens benchmark, the reward of a complete stage is kept even if its objects move
     later.

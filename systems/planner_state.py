@@ -101,8 +101,8 @@ class PlannerState(VectorView):
     """Position of the object's centre of mass relative to the pads' middle, along the pads, in m.
     It is recorded in the history if the object is set down again."""
     trial_weight = Number()
-    """The largest weight felt in the trial lift, in N. It is felt when the table bears least of the
-    object."""
+    """The largest weight felt in the trial lift, in N. It is felt when the table bears the least of
+    the object's weight."""
     doubts_grip = Number()
     """1 during a trial lift of an object that may turn between the pads, else 0."""
     trusts_grip = Number()

@@ -63,7 +63,7 @@ class RobotMotion(Protocol):
         """
 
     def back_off(self, state: PlannerState, distance: float) -> None:
-        """Raises the goal of the present mode, a straight line of the hand, by a distance."""
+        """Raises the goal of the present mode, in which the hand moves straight, by a distance."""
 
     def slow_down(self, state: PlannerState, time: float, share: float) -> None:
         """Continues with less acceleration, in this mode and in later ones that move the object.

@@ -131,8 +131,8 @@ _SHADOW = np.ones((3, 3), bool)
 """A hole into which this square fits may be the shadow of an object. A narrower hole is a gap
 between points that a camera measured."""
 _HIDDEN_BELOW = 0.005
-"""Pixels around a shadow that are higher than the lowest of them by more than this, in metres, may
-belong to the object that casts the shadow."""
+"""Pixels around a shadow may belong to the object that casts it if they are higher than the lowest
+of them by more than this, in metres."""
 
 
 def fill_unseen(
@@ -320,8 +320,9 @@ class Attempt:
     peak_force: float = 0.0
     """The largest contact force on the hand, in N, without the weight of the held object."""
     balance: tuple[float, float] | None = None
-    """World (x, y), in metres, of the object's centre of mass, estimated from the moment on the
-    wrist if the outcome is "set down"; else None. Only the position along the pads is measured."""
+    """World (x, y), in metres, of the object's centre of mass; None unless the outcome is "set
+    down". It is estimated from the moment on the wrist, which shows only the position along the
+    pads."""
 
 
 def wrap_to_pi(angle: float) -> float:

@@ -122,8 +122,8 @@ def _deviation(observation: Observation) -> float:
 
 
 def _sunk(observation: Observation, pixel: NDArray[np.float64]) -> float:
-    """Height of the table relative to the bottom of the grid at a (row, col), in metres, if it is
-    assumed to be lower; else 0."""
+    """Height of the table relative to the bottom of the grid at a (row, col), in metres. It is 0
+    unless the table is assumed to be lower."""
     level = float(np.array(observation.table) @ np.append(pixel, 1.0))
     return level if level < -_SUNK else 0.0
 

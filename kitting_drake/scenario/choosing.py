@@ -94,7 +94,7 @@ class ChosenScenario:
         return describe(self.scenario)
 
     def identity(self) -> dict[str, Any]:
-        """The scenario, versions and digests of its input files.
+        """The scenario, the versions of the software, and digests of the scenario's input files.
 
         Episodes depend on these values, so a run can be resumed only if they are equal.
         """

@@ -174,7 +174,7 @@ def _of_variants(given: object, current: Mapping[str, object]) -> object:
 def _load(
     raw: Any, defaults: Scenario, where: str, base: Path, *, merged: bool = False
 ) -> Scenario:
-    """Loads a mapping over defaults.
+    """Loads a scenario from a mapping; absent fields keep their values in `defaults`.
 
     Args:
         raw: the mapping, as `parse` returns it.

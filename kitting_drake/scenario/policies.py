@@ -194,13 +194,13 @@ class Learned(PolicyConfig):
 
     # Whether to correct failed insertions, take heaps apart and turn objects over. The policy first
     # presses down protruding objects. Then it picks objects that fit into a recess. When none is
-    # left, it lays objects that lie on others on the table, takes out objects that could not be
-    # pressed down, and turns over objects that lie upside down, in this order. No object is taken
-    # out twice. Recovery needs extra actions: see the task's `tries`.
+    # left, it takes objects off other objects, then takes out objects that could not be pressed
+    # down, and then turns over objects that lie upside down. No object is taken out twice. Recovery
+    # needs extra actions: see the task's `tries`.
     recover: bool = False
 
     def make_system(self, site: PolicySite) -> LeafSystem:
-        # Outlines and recesses matter only for insertion.
+        # Outlines and recesses matter only if objects are inserted into cavities.
         insertion = any(goal.rim_height is not None for goal in site.scene.goals)
         if self.recover and not insertion:
             raise UserError("policy.recover must be false: this task has no cavities to fill")
@@ -346,7 +346,7 @@ class PythonPolicy(PolicyConfig):
 
 @dataclass(frozen=True)
 class _OfObservationAlone:
-    """Calls a function that takes only an observation, and ignores the failed picks."""
+    """Calls a function that takes only an observation. The failed picks are ignored."""
 
     function: Callable[[Observation], PickPlaceAction]
     forgets: bool = False

@@ -15,7 +15,7 @@ from systems.bounds import bounded
 from systems.signals import PixelGrid
 
 FOOT = 0.08
-"""How far the foot of an arm extends in front of its base, in m."""
+"""How far the foot of an arm extends in front of the origin of the arm's base frame, in m."""
 
 
 @dataclass

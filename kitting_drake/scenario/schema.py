@@ -74,7 +74,7 @@ class Controller:
 
 @dc.dataclass
 class Variation:
-    """Random variation of all models except the robot."""
+    """Random variation of friction and mass of all models except the robot."""
 
     # The friction coefficients of each model are multiplied by a random factor between 1 - value
     # and 1 + value. `mass` is the corresponding range for the model's mass.
@@ -112,7 +112,7 @@ class Scenario:
     time_limit: float = bounded(180.0, 0.1, 1e6)
 
     # Whether to end the episode as soon as every goal is met, as in Ravens and the paper. Learned
-    # policies then never decide to stop. If false, the policy must detect that it is done.
+    # policies then never decide to stop. If false, the policy must decide to stop.
     end_at_success: bool = False
 
     # Speed of the simulation: 1 for real time, 0 for as fast as possible.
@@ -166,7 +166,7 @@ class Scenario:
     sleep: Sleep = dc.field(default_factory=Sleep)
 
     # Visualization: Drake's MeshcatParams. The page is served to this machine only; host: "*"
-    # serves it to all.
+    # serves it to all machines.
     meshcat: MeshcatParams = dc.field(
         default_factory=lambda: MeshcatParams(host="localhost", show_stats_plot=False)
     )

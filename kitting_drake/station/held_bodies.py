@@ -18,10 +18,10 @@ from pydrake.multibody.tree import Frame, RigidBody
 from pydrake.systems.framework import Context
 
 _LEAST_RATE = 0.05
-"""If all joints are slower than this, in rad/s, nothing is corrected."""
+"""If all joints are slower than this, in rad/s, no position is corrected."""
 _SAME_SPEED = 0.02
-"""A body moves with the hand if their velocities differ by less than this, in m/s, plus 5 % of the
-hand's velocity."""
+"""A body counts as carried by the hand if their velocities differ by less than this, in m/s, plus
+5 % of the hand's velocity."""
 
 
 class ArmPath:

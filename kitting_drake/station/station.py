@@ -432,8 +432,12 @@ def build_station(
 
 
 def _check_scene(scenario: Scenario, scene: Scene) -> None:
-    """Raises UserError if a task makes no scene, or if an object or a goal is off the table, too
-    high for the heightmap or too wide for the jaws."""
+    """Checks the scene that a task made.
+
+    Raises:
+        UserError: it is not a Scene, or an object or a goal is off the table, too high for the
+            heightmap or too wide for the jaws.
+    """
     if not isinstance(scene, Scene):
         raise UserError(f"task: make_scene must return a Scene, but returns {scene!r}")
     _check_on_table(scene)
@@ -483,7 +487,8 @@ def _check_on_table(scene: Scene) -> None:
 def _surface_groups(
     scene: Scene, still_bodies: Sequence[BodyIndex], objects: Sequence[PlacedObject]
 ) -> dict[BodyIndex, str]:
-    """The names of the bodies' surfaces in a scenario's `appearance`."""
+    """For each body, how its surfaces' names in a scenario's `appearance` begin: `table`,
+    `fixtures/NAME` or `objects/NAME`."""
     groups = {still_bodies[0]: "table"}
     for fixture, body in zip(scene.fixtures, still_bodies[1:], strict=True):
         groups[body] = f"fixtures/{fixture.name}"

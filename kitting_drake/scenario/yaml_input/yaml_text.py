@@ -17,7 +17,7 @@ _NULL = "tag:yaml.org,2002:null"
 
 
 class _Dumper(yaml.SafeDumper):
-    """Writes mappings that Drake's `yaml_load` returned.
+    """Writes as YAML the mappings that Drake's `yaml_load` returned.
 
     `yaml_load` keeps the tag of a mapping under the key `_tag`; here it becomes a tag again.
     """
