@@ -106,8 +106,8 @@ class PickPlacePolicy(LeafSystem):
         """
         if action.reason and action.reason not in STOP_REASONS:
             raise ValueError(
-                f"the policy {self._policy!r} must return as reason one of "
-                f"{', '.join(STOP_REASONS)}, not {action.reason!r}"
+                f"the policy {self._policy!r} must return one of "
+                f"{', '.join(STOP_REASONS)} as reason, not {action.reason!r}"
             )
         numbers: dict[str, Any] = {}
         for name, pose in action.poses.items():

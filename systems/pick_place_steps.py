@@ -27,8 +27,8 @@ from systems.robot_motion import RobotMotion
 _HOLDING = (Mode.LIFT, Mode.CARRY, Mode.LOWER, Mode.SEARCH, Mode.RELEASE)
 """The modes in which an object may be in the hand."""
 _STEADY = 0.6
-"""If an object's moment about the pads falls below this share of its earlier value, it has
-turned."""
+"""An object has turned if its lever (see `felt_lever`) falls below this fraction of its earlier
+value."""
 _STUCK = 0.004
 """Jaws that have opened by this much less than commanded, in m, stick to the object."""
 _PUSH = 1 / 3
@@ -209,7 +209,8 @@ class PickPlaceSteps:
         return is_heavy or turns or may_turn(turning)
 
     def _end_trial(self, moment: Moment, lever: float, weight: float) -> None:
-        """Ends a trial lift: continues to lift if the object has not turned, else sets it down.
+        """Ends a trial lift: sets the object down if it has turned or may turn on the way, else
+        continues to lift.
 
         Args:
             moment: the inputs, after the hand has rested.
@@ -217,7 +218,7 @@ class PickPlaceSteps:
             weight: the object's weight, in N.
         """
         state = moment.state
-        # An object that has turned until it leans on the table exerts less moment on the pads.
+        # As an object turns, its centre of mass swings down, and its lever becomes shorter.
         before = float(state.lever)
         has_turned = lever * before < _STEADY * before**2
         if has_turned:

@@ -34,7 +34,8 @@ appeared yet."""
 _FAR = 0.5
 """Larger displacements, in metres, count as this one when objects are assigned to goals."""
 _NEAR = 0.05
-"""Only an object within this distance of a goal is tested for filling it, in metres."""
+"""Objects farther than this from a goal, in metres, are assigned without a test whether they fill
+it."""
 _FREE_ANGLES = 24
 """Number of headings that are compared for a goal that accepts any heading."""
 

@@ -106,7 +106,7 @@ class PlannerState(VectorView):
     doubts_grip = Number()
     """1 during a trial lift of an object that may turn between the pads, else 0."""
     trusts_grip = Number()
-    """1 if the object did not turn in its trial lift, else 0."""
+    """1 if the trial lift has shown that the object will not turn on the way, else 0."""
     set_downs = Number()
     """Number of earlier actions that set this object down again."""
     free_actions = Number()

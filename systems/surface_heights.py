@@ -43,8 +43,8 @@ estimate in standard deviations of the noise."""
 _SUNK = 0.003
 """A table that looks lower than expected by more than this, in metres, is assumed to be lower."""
 _TILT_DOUBT, _MOST_DOUBT = 0.3, 0.0025
-"""The uncertainty of heights after levelling is `_TILT_DOUBT` times the table's deviation, but at
-most `_MOST_DOUBT`, in metres."""
+"""The uncertainty of heights is the noise plus `_TILT_DOUBT` times the table's deviation before
+levelling, but at most `_MOST_DOUBT`, in metres."""
 
 
 def read_surface_heights(
@@ -115,7 +115,7 @@ def read_surface_heights(
 
 
 def _deviation(observation: Observation) -> float:
-    """The largest deviation of the table from the bottom of the grid, in metres."""
+    """The table's largest distance from the bottom of the grid before levelling, in metres."""
     row, col, offset = observation.table
     rows, cols = observation.grid.shape
     return max(abs(row * i + col * j + offset) for i in (0, rows) for j in (0, cols))
