@@ -63,8 +63,8 @@ class ArmMotion(JawMotion):
 
     - `APPROACH`, `LIFT` with `CARRY`, `RETREAT`: motions in joint space, as fast as the joints'
       limits and the parameters' linear speed and acceleration allow. The hand rises straight up to
-      the clear height (see `MotionHeights`), travels above it, and sinks only near its goal.
-      Corners are rounded.
+      the clear height (with an object: the travel height; see `MotionHeights`), crosses above it,
+      and sinks only near its goal. Corners are rounded.
     - `DESCEND`, `LOWER`, `SEARCH`: straight lines of the hand, with the parameters' speeds.
     - If a mode begins while the arm moves, the arm first brakes, as fast as the limits of
       acceleration and jerk allow. The exception is `CARRY` after `LIFT`: these two are one motion.
@@ -270,7 +270,7 @@ class ArmMotion(JawMotion):
             goal = np.array(at)
         elif z is not None and abs(z - pose[2]) < _FARTHEST_STOP:
             # A payload makes the hand sag below its command. A goal at the sagged height would push
-            # the hand down.
+            # the hand further down.
             goal[2] = max(z, float(pose[2]))
         else:
             return
