@@ -56,12 +56,12 @@ class ContactGuard:
     - In `CARRY`, while the hand is above the travel height, the object is weighed: m is the mean of
       -f_z / (g + a_z). A contact further down therefore does not count as payload.
     - In `RELEASE` and `RETREAT` the jaws may or may not still hold the object, so any f_z between
-      its weight and zero counts as no contact.
+      the object's weight and zero counts as no contact.
 
     The guard acts if the vertical or the lateral force exceeds the limit. In `APPROACH` and
     `CARRY`, where nothing should touch the hand, it acts at once; in other modes, after 1/64 s. A
-    push from below does not count while the hand rises. Vertical forces do not count while it
-    presses an object down; there `press_force` is the limit.
+    push from below does not count while the hand rises. Vertical forces do not count while the
+    hand presses an object down; then `press_force` is the limit.
 
     A peak is the largest mean over 1/64 s, as a wrist sensor would show it. In a shorter time the
     force of an impact is its impulse divided by the plant's step, and so depends on the step. If

@@ -46,7 +46,7 @@ class HeightmapProjector(LeafSystem):
       pixel, a camera's highest point determines height and colour.
     - The fused height is the maximum over the cameras. The fused colour is the mean over the
       cameras that see the top surface, which are those whose height is within SAME_SURFACE (1 cm)
-      of it. The other cameras see a side of the object, or the ground in front.
+      of the fused height. The other cameras see a side of the object, or the ground in front.
     - A table that seems tilted by up to 2 degrees, or up to 1 cm off `z_min`, is levelled: its
       plane is subtracted (`table_plane.find_table`). Points below the levelled table get height 0.
     - A pixel is `in_view` if it is in some camera's image at the height `z_min`.

@@ -97,7 +97,7 @@ class OraclePolicy(LeafSystem):
     - `mode` (1) and `accepted_action` (abstract, `PickPlaceAction`): the planner's ports of those
       names, from which the oracle counts its attempts (see `AttemptMemory`).
     - `action` (abstract, `PickPlaceAction`): moves an object to a goal; `stop` when every goal is
-      filled.
+      filled, or no goal can be filled.
 
     The law chooses, in this order:
 

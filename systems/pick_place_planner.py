@@ -71,10 +71,10 @@ class PickPlacePlanner(LeafSystem):
     - `wrist_moment` (1): the moment of the contact forces about the hand's y axis, along which the
       jaws close, in N m, as a force-torque sensor at the wrist measures it while the hand moves
       vertically. It is positive for a load on the hand's +x side. It is evaluated in `LIFT` only.
-    - `desired_motion` (12): positions q_d, velocities v_d and accelerations a_d of (x, y, z, yaw),
-      in m, rad and s.
+    - `desired_motion` (12 or 21): positions q_d, velocities v_d and accelerations a_d of (x, y, z,
+      yaw), or of an arm's seven joints, in m, rad and s.
     - `desired_opening` (2): the opening between the pads in m, and its rate in m/s.
-    - `closing_force` (1): additional force of each pad, in N.
+    - `closing_force` (1): force of each pad in addition to the force that holds the opening, in N.
     - `mode` (1): a `Mode`.
     - `counts` (4): the numbers of actions begun, grasps missed, objects dropped, and actions
       stopped by the force guard.
@@ -94,9 +94,10 @@ class PickPlacePlanner(LeafSystem):
       actual yaws and without heights. After a stop it is the stopping action, with up to 24 objects
       and 24 cavities in its `left_over`.
 
-    Motions are smooth and as short as the limits on speed and acceleration allow (see
-    `systems.hand_motion`). In (x, y) they are straight lines; height and yaw move independently.
-    When `CARRY` continues from an unfinished `LIFT`, only the velocity is continuous.
+    Motions are smooth and as short as the limits on speed and acceleration allow. For an arm see
+    `ArmMotion`. A floating hand moves in straight lines in (x, y); height and yaw move
+    independently (see `systems.hand_motion`). When its `CARRY` continues from an unfinished `LIFT`,
+    only the velocity is continuous.
 
     - `LIFT`, `RETREAT`: the hand rises above the highest surface of o_t before it travels.
     - `APPROACH`, `CARRY`: near its goal, the hand sinks to just above the surfaces there.

@@ -91,7 +91,7 @@ class RestDetector(LeafSystem):
 
     - For `time_to_sleep` it has stayed within both tolerances of one pose. Displacements are
       compared, not velocities, because an object may tremble in place if the time step is too long
-      for its stiffness.
+      for the stiffness of its contacts.
     - No mover, and no object that is not at rest, is within `wake_distance` of it. The distances
       are those of the oriented boxes around the collision geometry, which are lower bounds.
 

@@ -55,8 +55,8 @@ def find_table(
     (row, col, 1)`.
 
     The search starts with a level plane at the lowest frequent height, and refits it to the pixels
-    near it. The result is zero if the plane deviates by less than 0.3 mm, if it is not near the
-    bottom of the grid, or if no plane is found.
+    near it. The result is zero if the plane deviates by less than 0.3 mm from the bottom of
+    the grid, if it is too far off or too steep for a calibration error, or if no plane is found.
 
     Args:
         height: (rows, cols) heights in metres above the bottom of the grid; may be negative.

@@ -1,10 +1,10 @@
 """Corrects the positions of free bodies that rotate while they are held.
 
 Drake advances the origin of a body's frame along a straight line in each time step. If the body
-rotates with angular velocity w about a point at a distance r from that origin, it drifts outward by
-r (w h)^2 / 2 in each step of length h. For example, a hammer that is held 45 mm from its frame's
-origin by a hand that turns at 2.5 rad/s slides through the pads by 1.1 mm in a second. By Newton's
-law it is the centre of mass, not the frame's origin, that should move straight.
+rotates with angular velocity w about a point at a distance r from that origin, the body drifts
+outward by r (w h)^2 / 2 in each step of length h. For example, a hammer that is held 45 mm from its
+frame's origin by a hand that turns at 2.5 rad/s slides through the pads by 1.1 mm in a second. By
+Newton's law it is the centre of mass, not the frame's origin, that should move straight.
 """
 
 from collections.abc import Sequence

@@ -115,7 +115,7 @@ class KittingStation(Diagram):
       the calibrated pose X_WB of the camera; the observation is computed from them.
 
     All state is in the Context. Ports compute only on demand; in particular, images are rendered
-    only when an observation is evaluated.
+    only when an observation or an image is evaluated.
 
     Simulate the station with `make_simulator`. It lets objects appear during the episode, and
     freezes objects at rest.
