@@ -19,8 +19,8 @@ ROOT = Path(__file__).resolve().parents[1]
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 
-# Modules and tests stay in memory, so there is little garbage among them. Looking for it would take
-# a third of the time of importing them, and more later.
+# Modules and tests stay in memory, so there is little garbage to find. Looking for it would take
+# a third of the time of imports, and more during tests.
 gc.disable()
 
 
@@ -69,7 +69,7 @@ def verb(
 ) -> Iterator[Callable[..., subprocess.CompletedProcess[str]]]:
     """Runs `python -m kitting_drake.VERB ARGUMENTS...` in this process, from the root of the tree.
 
-    It is faster than another process. The result holds the exit code and the output.
+    This is faster than starting a process. The result holds the exit code and the output.
     """
 
     def run(name: str, *arguments: object) -> subprocess.CompletedProcess[str]:

@@ -20,7 +20,7 @@ def test_own_policy_example(tmp_path: Path):
     assert text in (DOCS / "architecture.md").read_text()
     log = runpy.run_path(str(EXAMPLE))["main"](tmp_path / "force.png")
     times, force = log.sample_times(), log.data()[2]
-    # The hand carries a screwdriver of 70 g, then presses it onto the table.
+    # The carried screwdriver of 70 g weighs 0.7 N. Then the hand presses it onto the table.
     assert -0.8 < force[(times > 2.1) & (times < 2.7)].mean() < -0.5
     assert force.max() > 2.0
     assert (tmp_path / "force.png").stat().st_size > 5000
@@ -35,7 +35,7 @@ def test_own_task_example(tmp_path: Path):
     scenario = load_scenario(tmp_path / "tower.yaml")
     scene = scenario.task.make_scene(grid=scenario.heightmap.grid(), seed=0, base=tmp_path)
     assert [goal.poses[0].translation()[2] for goal in scene.goals] == [0, 0.05]
-    # The tutorial runs the same class.
+    # One cell of the tutorial is the example's class.
     cells = json.loads((DOCS / "tutorial.ipynb").read_text())["cells"]
     start = code.index("from kitting_drake.")
     assert code[start:].rstrip() in ["".join(cell["source"]) for cell in cells]

@@ -1,6 +1,6 @@
 """escnn works without lie_learn and without a compiler.
 
-Layers for the plane run in a new process here, and in the tests' own in `escnn_reference_test`.
+These tests use a new process; `escnn_reference_test` uses escnn in the process of the tests.
 """
 
 import subprocess

@@ -39,7 +39,10 @@ BAD = {11, 14, 15}
 
 
 class Oracle:
-    """Demonstrates immediately, until it is interrupted; records the seeds that it is asked for."""
+    """Returns demonstrations at once, without a simulation, and records the requested seeds.
+
+    The seeds in BAD are rejected. After `killed_after` seeds, it raises KeyboardInterrupt.
+    """
 
     def __init__(self, killed_after: int = 1000) -> None:
         self.asked: list[int] = []
@@ -95,7 +98,7 @@ def test_ranges_of_seeds_are_disjoint():
         ([], [], [], 10),
         ([], [], [10, 11], 12),
         ([10], [], [11, 12], None),
-        # A seed in progress was rejected.
+        # One seed was rejected, while another is in progress.
         ([10], [11], [12], 13),
         # A killed run left a gap.
         ([10, 12], [], [], 11),
@@ -273,7 +276,7 @@ def test_a_scenario_without_cameras_is_refused(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr(sys, "argv", ["collect", str(scenario), "--output", str(tmp_path / "out")])
     with pytest.raises(UserError, match=r"blind\.yaml: cameras is empty"):
         collecting.main()
-    # The corrected scenario can use the same folder.
+    # Nothing was written, so the corrected scenario can use the same folder.
     assert not (tmp_path / "out" / "scenario.json").exists()
 
 
@@ -330,7 +333,8 @@ def test_demonstrations_are_exported(
 
     main(1)
     assert not (tmp_path / "lerobot").exists()
-    # The export records missing frames, but collects nothing. A second export changes nothing.
+    # The first export records the demonstration again, because its frames are missing.
+    # The second export changes nothing.
     told = main(1, "--export", "lerobot")
     assert told.startswith("nothing to collect: ")
     assert told.endswith(f"as a LeRobotDataset: {tmp_path / 'lerobot'}/\n")

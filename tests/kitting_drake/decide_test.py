@@ -58,7 +58,7 @@ def rendered(seed: int, policy: str) -> Rendered:
 def check_against_cell(seed: int, folder: Path, orientations: int = 180) -> None:
     """Checks that the generalist decides on frames from files as in the cell.
 
-    On .npy the decisions must be bit-identical, on .png (whole millimetres) about equal.
+    With depths as .npy the decisions are bit-identical; as .png (whole mm) they are about equal.
     """
     found = rendered(seed, f'!Learned {{weights: "", orientations: {orientations}}}')
     write_calibration(folder / "calibration.yaml", found.calibration)

@@ -77,7 +77,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def folder(written: Path, tmp_path: Path) -> Path:
-    """Two demonstrations, one of which ends with a stop, at a step whose number has two digits."""
+    """Two demonstrations. The first one has the steps 9, 10 and 11; the last of them is a stop."""
     return shutil.copytree(written, tmp_path, dirs_exist_ok=True) / "my bench"
 
 
@@ -145,7 +145,7 @@ def test_train_takes_the_file(folder: Path, command, monkeypatch: pytest.MonkeyP
 
 
 def test_seeds_identify_frames(folder: Path):
-    """A demonstration's seed depends on its frames only, not on the file or its neighbours."""
+    """A demonstration's seed depends on its frames only, not on names or other demonstrations."""
     first, second = folder.parent / "first.h5", folder.parent / "second.h5"
     convert(folder, BENCH, KITTING, first)
     (folder / "demo2").rename(folder / "again")
@@ -171,7 +171,7 @@ def test_the_command_needs_neither_drake_nor_torch(
     folder: Path,
     verb: Callable[..., subprocess.CompletedProcess[str]],
 ):
-    """Invalid input prints one line and keeps the existing file."""
+    """A second run, with invalid input, prints one line and keeps the file of the first run."""
     output = folder.parent / "out"
     words = [folder, "--camera", folder.parent / "calibration.yaml", "--output", output]
     if process:
@@ -275,7 +275,7 @@ def test_folders_without_demonstrations_are_refused(tmp_path: Path):
 def test_calibrations_are_compared_by_value(tmp_path: Path):
     write_calibration(tmp_path / "same.yaml", BENCH)
     assert calibration_digest(read_calibration(tmp_path / "same.yaml")) == calibration_digest(BENCH)
-    # A pose that was written in another layout differs by rounding.
+    # The same pose, written as another kind of rotation, differs by rounding.
     other = with_poses(BENCH, {camera.name: camera.X_BC - 1e-15 for camera in BENCH.cameras})
     assert calibration_digest(other) == calibration_digest(BENCH)
     moved = with_poses(BENCH, {camera.name: camera.X_BC + 1e-5 for camera in BENCH.cameras})

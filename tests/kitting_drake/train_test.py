@@ -653,7 +653,7 @@ def test_another_scenario_or_version_is_another_run(
 
 
 def test_other_images_are_another_run(folder: Path, tmp_path: Path, refused: Callable[..., str]):
-    """Demonstrations can have other images with the same seeds, as other code collected them."""
+    """If the code has changed, demonstrations with the same seeds can have other images."""
     path = tmp_path / "others.h5"
     changed = demonstration(10)
     brighter = dataclasses.replace(changed.steps[0], height=changed.steps[0].height + 0.001)

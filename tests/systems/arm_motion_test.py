@@ -156,7 +156,7 @@ def test_the_hand_s_acceleration_is_that_of_the_joints():
     ("pick", "place", "tilts"),
     [
         ((0.39, 0.31, 1.44), (0.37, -0.13, 1.48), False),
-        # The arm must lie in its vertical plane when it places; when it picks, it cannot.
+        # Here the hand must also tilt during LIFT, by up to 46 degrees.
         ((0.348, 0.008, 1.396), (0.719, -0.166, -1.358), True),
     ],
 )
@@ -259,7 +259,7 @@ def test_what_cannot_be_reached_is_said():
     assert problem(0.5, 0.2) == ""
     assert "out of the arm's reach" in problem(0.95, 0.3)
     assert "out of the arm's reach" in problem(0.5, 0.0, high=1.2)
-    # So far below the surface around the hand, the forearm would collide with it.
+    # If the hand reaches 0.2 m below the surface around it, the forearm collides with the surface.
     deep = HandStop("the place", 0.5, 0.2, 0.3, low=-0.2, high=0.1, surface=0.0)
     assert "collide" in reach_problem(postures, [deep])
     post = Capsule((0.6, 0.0, -0.5), (0.6, 0.0, 0.3), 0.02)

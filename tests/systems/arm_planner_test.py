@@ -19,7 +19,7 @@ PICK, PLACE = PlanarPose(0.5, 0.3, 0.5), PlanarPose(0.55, -0.2, -0.8)
 TOO_FAR = PlanarPose(0.95, -0.6, 0.0)
 HEIGHTS = SurfaceHeights(pick_top=0.03, place_rim=0.05, place_floor=0.0, highest=0.05)
 WIDTH, FLOOR = 0.02, 0.004
-"""The object's width, and the height of the fingertips when it touches its floor, in m."""
+"""The object's width, and the fingertip height at which it touches the place's floor, in m."""
 
 
 class PerfectArm(LeafSystem):

@@ -75,7 +75,7 @@ def disagreements(limits: ArmLimits, poses: int, seed: int) -> tuple[list[str], 
         # The search ignores collisions, so poses that only a collision rules out count as reached.
         says = not problem or "collide" in problem
         pose = BASE.to_base([x, y, z, yaw])
-        # Few starts miss some poses that can be reached: try again where the closed form says so.
+        # One search misses some reachable poses: repeat it where the closed form has a solution.
         expected = any(search(limits, pose, rng) for _ in range(10 if says else 1))
         if says != expected:
             found.append(f"{x:.3f} {y:.3f} {z:.3f} {yaw:.3f}: search {expected}, '{problem}'")

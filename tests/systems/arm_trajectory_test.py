@@ -62,7 +62,7 @@ def test_the_hand_is_where_the_action_says():
         it.mode: motion.postures.hand_pose(trajectory.positions[it.last])
         for it in trajectory.segments
     }
-    # At the pick the fingertips go 10 mm below the object's top, at the place to the cavity's rim.
+    # The fingertips end 10 mm below the object's top at the pick, at the cavity's rim at the place.
     np.testing.assert_allclose(ends["DESCEND"][:3], [0.45, 0.2, 0.01], atol=1e-3)
     np.testing.assert_allclose(ends["LOWER"][:3], [0.55, -0.1, 0.05], atol=1e-3)
     turned = ends["LOWER"][3] - ends["DESCEND"][3]
@@ -106,7 +106,8 @@ def test_segments_and_jaws():
         ("RETREAT", None),
     ]
     assert pressed.width_at(pressed.duration)[0] == 0.0
-    # A press may end 20 mm below the object's top. Here that is the table, so it ends above it.
+    # A press may go 20 mm below the object's top. Here this would be the table's height, so the
+    # press ends above it, at the clearance.
     motion = ArmMotion(PARAMETERS, FR3, ArmBase())
     lowest = motion.postures.hand_pose(pressed.positions[pressed.segments[1].last])[2]
     assert lowest == pytest.approx(PARAMETERS.floor_clearance, abs=1e-4)

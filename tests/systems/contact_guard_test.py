@@ -62,7 +62,7 @@ def test_contact_below_the_travel_height_is_not_weighed():
     hand.feel((0, 0, 15.0), height=0.05, times=2)
     assert hand.state.payload == pytest.approx(-5.0)
     assert hand.state.peak_vertical == pytest.approx(20.0)
-    # A tare during such a contact does not change the payload either.
+    # A tare while something touches the hand does not change the payload either.
     hand.guard.tare(hand.state, np.array([0, 0, 15.0, 0, 0, 0]), 4.0)
     assert hand.state.payload == pytest.approx(-5.0)
     hand.guard.tare(hand.state, np.array([0, 0, -5.5, 0, 0, 0]), 4.0)

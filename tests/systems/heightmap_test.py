@@ -34,7 +34,8 @@ def test_pixels_outside_all_images_are_out_of_view():
     seen = project([flat(focal=900.0)], GRID)
     assert 0.1 < seen.in_view.mean() < 0.7
     assert seen.valid[seen.in_view].mean() > 0.99
-    # A pixel is in view if the table there would be; a box at an image's edge may show beyond it.
+    # A pixel counts as in view if a camera would see the table there. A high box may be seen where
+    # the table would not be.
     assert seen.valid[~seen.in_view].mean() < 0.03
     middle = tuple(np.rint(GRID.to_pixel((0.5, 0.0))).astype(int))
     assert seen.in_view[middle]
@@ -96,7 +97,7 @@ def test_the_shadow_of_an_object_is_table():
     height[10:20, 10:20] = 0.02
     valid = np.ones(height.shape, bool)
     valid[10:20, 20:26] = False  # The object's shadow is six pixels wide.
-    valid[14:16, 13:15] = False  # Pixels without depth on top of the object.
+    valid[14:16, 13:15] = False  # A hole in the depths on top of the object.
     filled = fill_unseen(np.where(valid, height, 0), valid)
     assert not filled[10:20, 20:26].any()
     np.testing.assert_array_equal(filled[14:16, 13:15], np.float32(0.02))

@@ -54,7 +54,7 @@ class Table:
         self.poses[body] = self.poses[body] @ motion
 
     def hand_over(self, body: int, gap: float) -> None:
-        """Puts the hand over a bar with this gap between the boxes."""
+        """Puts the hand over a bar, with this gap (m) between their boxes."""
         self.poses[HAND] = self.poses[body] @ RigidTransform([0, 0, 0.01 + 0.02 + gap])
 
 

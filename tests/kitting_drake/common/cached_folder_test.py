@@ -21,7 +21,7 @@ def test_prune_keeps_the_newest_and_the_young(tmp_path: Path, monkeypatch: pytes
         folder.mkdir()
         write(folder)
         os.utime(folder, (now - age * hour,) * 2)
-    # Using folder a makes it the newest.
+    # Using folder `a` makes it the newest: its time of use becomes the present.
     cached_folder(tmp_path / "a", ["file"], write)
     prune(tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {"a", "e", "d"}

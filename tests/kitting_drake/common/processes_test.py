@@ -85,7 +85,7 @@ def test_parallel_processes_use_one_thread_each(
 
 
 class Growing(LocalWorkers):
-    """Workers that can run one call at first, then two."""
+    """Workers that can run one call at a time at first, later two at a time."""
 
     def __init__(self) -> None:
         super().__init__(1)

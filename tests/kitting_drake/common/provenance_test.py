@@ -38,7 +38,7 @@ def test_commit_marks_uncommitted_changes(checkout: Path):
     head = git(checkout, "rev-parse", "HEAD")
     assert len(head) == 40
     assert commit() == head
-    (checkout / "output.json").write_text("{}")  # An untracked file.
+    (checkout / "output.json").write_text("{}")  # An untracked file does not count.
     assert commit() == head
     (checkout / "kitting_drake" / "__init__.py").write_text("changed = True\n")
     assert commit() == f"{head}+"

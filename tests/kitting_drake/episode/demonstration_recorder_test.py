@@ -92,7 +92,7 @@ def test_records_the_policys_observation(monkeypatch: pytest.MonkeyPatch):
     assert_shows(step, seen[0])
     assert step.height.max() > 0.04
     assert (step.pick, step.place) == (action.pick, action.place)
-    assert made.final is None  # This recorder did not see the end.
+    assert made.final is None  # This recorder did not see the end of the episode.
 
 
 def as_success(result: EpisodeResult, *outcomes: str) -> EpisodeResult:
@@ -152,7 +152,7 @@ def test_failed_actions_are_omitted():
     assert recorder.demonstration(less) == Rejection(3, 0.5, "the reward was 50%")
     failed = dataclasses.replace(result, success_rate=0.0, failure="the solver", actions_taken=[])
     assert recorder.demonstration(failed) == Rejection(3, 0.0, "the solver")
-    # If later picks are labels too, a demonstration with two actions on one object is rejected.
+    # With `later_picks_possible`, a demonstration with two actions on one object is rejected.
     first, *others, last = result.actions_taken
     twice = [first, *others, dataclasses.replace(last, object=first.object)]
     again = dataclasses.replace(result, actions_taken=twice)

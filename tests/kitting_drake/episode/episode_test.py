@@ -242,7 +242,7 @@ def test_a_policy_is_called_only_after_the_planner_has_observed(monkeypatch: pyt
     rig = build(scenario)
     asked: list[tuple[Mode, int]] = []
     result = rig.run(lambda event: asked.append((event.mode, len(stub.seen))), seconds=30.0)
-    # The policy is called once before each of the two modes that follow OBSERVE, and never else.
+    # The policy is called once before APPROACH, once before DONE, and at no other time.
     assert asked[0] == (Mode.APPROACH, 1)
     assert {count for mode, count in asked[:-2]} == {1}
     assert asked[-2:] == [(Mode.DONE, 2), (Mode.DONE, 2)]

@@ -169,8 +169,10 @@ def test_tools_in_their_cavities_do_not_creep():
 
 
 class Misjudged(ArrangedKitting):
-    """The grasp is annotated 8 degrees off, so the closing jaws rotate the tool. A tool that is
-    rotated by 5 degrees slips in without a search."""
+    """The grasp is annotated 8 degrees off, so the closing jaws rotate the tool.
+
+    If they rotated it by only 5 degrees, it would slip into its cavity without a search.
+    """
 
     def make_scene(self, **more) -> Scene:
         scene = super().make_scene(**more)

@@ -70,7 +70,7 @@ def test_no_gripper_is_drawn_if_the_policy_stops(observation: Observation, pictu
 
 
 def test_pictures_show_what_is_not_seen(observation: Observation):
-    """Pixels out of view are grey; unseen ones within the view are striped. Both in two panels."""
+    """Pixels out of view are grey, and unseen ones within the view are striped, in two panels."""
     valid, in_view = np.ones((2, *GRID.shape), bool)
     valid[:, 10:], in_view[:, 30:] = False, False
     partly = dataclasses.replace(observation, valid=valid, in_view=in_view)

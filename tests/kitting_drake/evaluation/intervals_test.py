@@ -6,7 +6,7 @@ from kitting_drake.evaluation.intervals import mean_interval, proportion_interva
 
 
 def test_proportion_interval():
-    # 8 of 10: the textbook's 0.490 to 0.943.
+    # Wilson's interval for 8 of 10.
     assert proportion_interval(8, 10) == pytest.approx([0.4902, 0.9433], abs=1e-4)
     low, high = proportion_interval(200, 200)
     assert high == pytest.approx(1.0)

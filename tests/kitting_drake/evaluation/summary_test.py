@@ -72,7 +72,7 @@ def test_failed_episodes_count_zero():
     assert summary["success_rate"] == pytest.approx(3 / 8)
     assert summary["ci95"] == pytest.approx(proportion_interval(3, 8))
     assert summary["causes"] == CAUSES | {"misplaced": 1, "failed episode": 2, "timed out": 2}
-    # Errors are those of the completed episodes.
+    # Failed and timed-out episodes do not contribute errors.
     assert summary["add_s_mm"] == pytest.approx({"median": 1.0, "p95": 7.8, "max": 9.0})
     assert summary["action_errors"]["place_position_error_mm"]["max"] == pytest.approx(18.0)
     assert (summary["wall_seconds"], summary["wall_seconds_total"]) == (40.0, 25.0)
@@ -177,7 +177,7 @@ def test_intervals_of_partial_rewards_are_over_episodes():
 
 
 def test_intervals_of_dependent_objects_are_over_episodes():
-    """Even if an episode's reward is the fraction of its objects that succeed, as here."""
+    """The interval is over episodes even if the reward is the fraction of objects that succeed."""
     chosen = dataclasses.replace(CHOSEN, scenario=Scenario(task=StackBlockPyramid()))
     episodes = [make_episode(seed, [1.0, 9.0 if seed % 2 else 1.0]) for seed in range(6)]
     summary = summarise(episodes, chosen, PoseWithin(), wall_seconds_total=1.0)

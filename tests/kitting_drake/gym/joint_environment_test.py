@@ -138,7 +138,7 @@ def test_frames_are_taken_at_equal_times(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_a_closing_force_is_a_smaller_opening(path: Path):
-    # 30 N at 800 N/m is 37.5 mm for each finger.
+    # A force of 30 N at 800 N/m moves each finger by 37.5 mm, so the opening shrinks by 75 mm.
     view = object.__new__(JointView)
     values = {
         "commanded": np.array([0.1, 0.2, 0.3, 0.4, *np.zeros(8)]),

@@ -137,7 +137,7 @@ def test_an_episode_equals_that_of_evaluate(small: Path, monkeypatch: pytest.Mon
     assert total == expected["success_rate"] == 1.0
     assert len(info["failed_picks"]) == 1
     assert [attempt["outcome"] for attempt in info["history"]] == ["missed", "placed"]
-    # All results are equal: every goal is filled, so the episode ends without a stop.
+    # Every goal is filled, so both episodes end without a stop, with equal results.
     assert {key for key in expected if info.get(key) != expected[key]} == {"policy", "wall_seconds"}
 
 
@@ -288,7 +288,7 @@ def test_a_step_costs_what_an_action_costs_in_evaluate(monkeypatch: pytest.Monke
             here, there = here + time.process_time() - middle, there + middle - start
         assert total == result["success_rate"]
         for own, other in zip(info["objects"], result["objects"], strict=True):
-            # The agent's o_t is one time step older, so an object may have moved a little since.
+            # The environment's o_t is one time step older than that of `evaluate`.
             assert own["add_s_mm"] == pytest.approx(other["add_s_mm"], abs=0.01)
     print(f"a step costs {here / there:.3f} of an action in evaluate")
     assert here / there < 1.1

@@ -119,7 +119,7 @@ def test_refinement_goes_beyond_pixels_and_bins():
 
 @pytest.mark.parametrize("bins", [0, ROTATION, 40, N - 1])
 def test_the_offset_of_a_refined_pick_is_rotated_to_the_place(bins: int):
-    """The place is that of the crop's centre pixel plus the pick's offset from it, rotated."""
+    """A pick that is off the crop's centre pixel moves the place by the same offset, rotated."""
     at_the_pixel, beside_it = (
         decide(Known(pick=pick, rotation=bins * BIN), continuous=True) for pick in ((61, 22), PICK)
     )
@@ -194,7 +194,7 @@ def test_a_position_does_not_depend_on_other_peaks():
     np.testing.assert_allclose(expected_position(two, (2, 2)), (2, 2), atol=1e-5)
 
 
-# The window's first bin and its corner pixel, and the label relative to them.
+# A window of the place volume: its first bin, its corner pixel, and the label, relative to them.
 PLACEMENTS = [
     (10, (5, 7), (2.3, 3.6, 4.4)),
     (-4, (0, 0), (3.0, 0.0, 0.4)),

@@ -133,12 +133,12 @@ def test_invalid_actions_are_rejected(
 
 
 def test_other_origins_are_rejected(server: AnnotationServer, folder: Path):
-    """A browser lets other sites send plain text here, and their host names may point here."""
+    """Other sites can make a browser send plain text here, or let their host name point here."""
     assert post(server, "steps/0", POSES, "text/plain")[0] == 403
     connection = http.client.HTTPConnection(*server.server_address)
     connection.request("GET", "/steps", headers={"Host": "elsewhere.example:80"})
     assert connection.getresponse().status == 403
-    # If the port is 80, a browser omits it.
+    # A browser omits the port from `Host` if it is 80.
     connection = http.client.HTTPConnection(*server.server_address)
     connection.request("GET", "/steps", headers={"Host": "localhost"})
     assert connection.getresponse().status == 200

@@ -1,4 +1,4 @@
-"""Frames are read from every kind of file, with the meaning that the writing tool gives it."""
+"""Frames from every kind of file are read as the tool that wrote the file means them."""
 
 import base64
 import dataclasses

@@ -49,7 +49,7 @@ def action(config: PolicyConfig, site: PolicySite, seen: Observation) -> PickPla
     """The action that a policy's system outputs for an observation."""
     system = config.make_system(site)
     context = system.CreateDefaultContext()
-    # A policy that uses no colours has another port.
+    # A policy that uses no colours has the port `observation_heights` instead of `observation`.
     heights = system.HasInputPort("observation_heights")
     name = "observation_heights" if heights else "observation"
     system.GetInputPort(name).FixValue(context, Value(seen))

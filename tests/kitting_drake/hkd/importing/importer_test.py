@@ -52,7 +52,7 @@ def bring(path: Path, folder: Path, **options: object) -> importer.ImportReport:
 
 
 def solid_of(mesh: trimesh.Trimesh) -> tuple[Manifold, list[str]]:
-    """The solid of a mesh, at the importer's size, and the notes on its repairs."""
+    """The solid of a mesh, scaled as by the importer, and the notes on its repairs."""
     scale = NOMINAL_MM / mesh.extents.max()
     return make_solid(scale * (mesh.vertices - mesh.bounds.mean(axis=0)), mesh.faces)
 
@@ -490,7 +490,7 @@ def test_numbers_out_of_range(options: dict, tmp_path: Path):
 def test_the_child_process_has_a_limit_of_time(tmp_path: Path):
     path = exported(mallet(), tmp_path / "mallet.stl")
     with pytest.raises(UserError, match="s of processor time and was stopped while"):
-        # Starting the process takes longer than 1 s, the least limit that is allowed.
+        # A limit is raised to at least 1 s. Starting the process takes longer.
         import_tool(ImportRequest(path, "hammer", output=tmp_path / "tools"), time_limit=-9.0)
     assert not (tmp_path / "tools").exists()
 

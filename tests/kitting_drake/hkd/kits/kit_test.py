@@ -137,7 +137,7 @@ def test_the_contact_surface_has_the_walls_of_the_block(tools: list[Tool], lead_
         area, centre = mesh_.area_faces[chosen], mesh_.triangles_center[chosen]
         return area.sum(), area @ centre, (area * mesh_.face_normals[chosen].T) @ centre
 
-    for low, high in ((-0.1, 0.1), (0.1, 0.9)):  # First walls, then bevels.
+    for low, high in ((-0.1, 0.1), (0.1, 0.9)):  # Normals of walls, then of bevels.
         for one, other in zip(facing(block, low, high), facing(contact, low, high), strict=True):
             np.testing.assert_allclose(one, other, atol=2e-7)
     # The floors are at the block's heights and face up.
@@ -237,7 +237,7 @@ def test_concurrent_builds_of_the_same_kit_both_succeed(
 
     def write_together(*arguments: object) -> None:
         write(*arguments)  # type: ignore[arg-type]
-        both.wait(timeout=60)  # Both are written, but neither is in its final folder yet.
+        both.wait(timeout=60)  # Both threads have written; neither has moved its kit yet.
 
     monkeypatch.setattr(kit_module, "_write", write_together)
     with ThreadPoolExecutor(2) as pool:
@@ -354,7 +354,7 @@ def test_nested_cavities_have_walls_and_room_for_the_fingers(
             if i != j:
                 assert (grown(rim, wall - 1e-4) ^ other).area() < 1e-9, (names[i], names[j])
                 assert (fingers[i] ^ other).area() < 1e-9, (names[i], names[j])
-    # The block is compact.
+    # The block is little larger than the cavities and the walls around them.
     bounds = np.array(CrossSection.batch_boolean(rims, OpType.Add).bounds())
     extents = bounds[2:] - bounds[:2]
     size = np.array([layout.parameters.length, layout.parameters.width])

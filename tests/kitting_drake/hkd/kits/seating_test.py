@@ -31,5 +31,5 @@ def test_a_bite_in_the_model_leaves_no_room():
     model = wrench() - bite
     seat = find_seat(wrench(), model, cavity_outline(model, EASY))
     assert seat.room < 0
-    # Moving away from the bite shares its overlap of 0.3 mm between both sides.
+    # At the bite the tool is 0.3 mm wider than the cavity: 0.15 mm on each side.
     assert seat.room == pytest.approx((0.7e-3 - 1e-3) / 2, abs=1e-4)

@@ -174,7 +174,7 @@ def test_an_outline_that_may_be_wrong_is_in_doubt_until_its_user_settles_it(tmp_
     # The steel is as bright as the shadow beside it.
     pale = PlacedTool(SPANNER.translate((90, 100)), 14, ("steel", "steel"))
     path = photo_of(tmp_path, pale, shadow=0.5, light=(0.9, -0.9), softness=0.2, seed=2)
-    # A correction in another part of the photo settles no doubt.
+    # A correction in another part of the photo leaves this outline doubtful.
     points = tmp_path / "points.yaml"
     points.write_text("- remove: [[0, 0], [297, 0], [297, 60], [0, 60]]\n")
     (tool,) = traced(path, points=points).tools

@@ -128,7 +128,7 @@ def test_crops_are_centred_near_the_label(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_the_place_label_follows_the_crop_s_centre(monkeypatch: pytest.MonkeyPatch):
-    """The label of a crop beside the pick is as far from the place, in the rotated direction."""
+    """If the crop's centre is off the pick, the label is off the place by the rotated offset."""
     networks, sample = ZeroNetworks(), dataclasses.replace(scene(0), rotation=math.radians(-150.0))
     told: list[Any] = []
     monkeypatch.setattr(networks, "encode_scene", lambda image: "phi")

@@ -77,7 +77,7 @@ def test_stops_when_all_tools_are_in_the_kit():
     finished, unfinished = (policy(stored_observation(name)) for name in names)
     assert finished.stop
     assert not unfinished.stop
-    # Both log-odds are at least 2 from the threshold.
+    # The log-odds of both observations are at least 2 from the threshold.
     odds = [policy.log_odds(stored_observation(name)) for name in names]
     assert odds[0] < networks.stop_threshold - 2 < networks.stop_threshold + 2 < odds[1]
 

@@ -118,9 +118,10 @@ def test_wrong_stop_decisions_are_counted_and_cost_as_if_lost():
 @pytest.mark.parametrize(
     ("present", "absent", "threshold"),
     [
-        # If the log-odds separate, the threshold is between, nearer to the final observations.
+        # If the two ranges of log-odds do not overlap, the threshold lies between them, nearer to
+        # that of final observations.
         ((3.0, 9.0, 5.0), (-1.0, -7.0), 0.0),
-        # Otherwise the threshold makes the fewest errors; of equally good ones it is the lower one.
+        # Otherwise it is the threshold with the fewest errors; the lowest one if there are several.
         ((3.0, 5.0, 6.0, -2.0), (-1.0, -3.0, 0.0), 0.75),
         ((1.0,), (2.0,), 0.0),
         ((), (1.0,), None),

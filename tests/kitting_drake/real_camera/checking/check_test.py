@@ -105,7 +105,7 @@ def test_finds_a_tilt_and_its_axis(table: dict[str, Frame], axis: tuple[float, f
 
 def test_finds_a_camera_that_is_too_high(table: dict[str, Frame]):
     check = check_cameras(noisy(table), moved("front", shift=(0, 0, 0.003)))
-    # The default clearance is 1.5 mm, and the table seems 3 mm too high.
+    # If `table_height` is 3 mm too low, the clearance of 1.5 mm above it is not enough.
     assert "may go 1.5 mm into the table" in _meaning(check, "height bias")
     lines = findings(check, PickPlaceParameters(floor_clearance=0.0025))
     assert any("may go 0.5 mm into the table" in line.meaning for line in lines)

@@ -143,7 +143,7 @@ def test_trainings_are_compared_from_two_on(runs: tuple[Run, ...]):
     more = [*runs, make_run("unseen_so2_180_100_seed2", [1.0, 1.0, 1.0, 1.0])]
     found = rows(sections(more))
     ours = found["SO(2)-equivariant (ours)", "unseen"]
-    # The two trainings have 75 % and 100 %.
+    # The success rates of the two trainings are 75 % and 100 %.
     assert ours == ["75.0 / 75.0", "-", "100.0 / 100.0", "87.5 ± 17.7 / 87.5 ± 17.7"]
     assert ("Equivariant Transporter", "unseen") not in found
     theirs = "unseen_equivariant_transporter_180_100_seed2"
