@@ -1,4 +1,4 @@
-"""Decisions on frames from files equal those in the cell, and need no Drake."""
+"""Decisions on frames from files equal those in the simulated cell, and need no Drake."""
 
 import dataclasses
 import io

@@ -73,10 +73,10 @@ def check_limits(limits: ArmLimits, samples: NDArray, inertia: ArmInertia) -> No
 
 
 def check_random_ways(model: str, actions: int, seed: int) -> int:
-    """Checks the limits on all ways of random actions, some of them cut short by a stop.
+    """Checks the limits in all motions of random actions, some of them cut short by a stop.
 
     Returns:
-        The number of ways.
+        The number of motions.
     """
     limits, rng = ARM_LIMITS[model], np.random.default_rng(seed)
     inertia = ArmInertia(arm_model(FrankaArm(model=model))[0])
@@ -102,7 +102,7 @@ def check_random_ways(model: str, actions: int, seed: int) -> int:
             time += lasts
             at_rest = motion.motion_at(state, time)
             np.testing.assert_allclose(at_rest[7:], 0.0, atol=1e-12)
-    # Ways do not begin at whole milliseconds, so check the limits on each by itself.
+    # Motions do not begin at whole milliseconds, so check the limits in each by itself.
     for part in samples:
         if len(part) > 2:
             check_limits(limits, part, inertia)
@@ -206,12 +206,12 @@ def test_the_hand_follows_its_heights(has_inertia: bool):
     np.testing.assert_allclose(hand[:3], [0.5, -0.3, PARAMETERS.floor_clearance], atol=1e-6)
     turn = math.remainder(float(hand[3]) - 2.0, math.pi)
     assert abs(turn) < 1e-6
-    # On all ways the hand points down.
+    # In all motions the hand points down.
     assert max(down.max() for down in downs.values()) < -0.9999
     lift = tips[Mode.LIFT]
     away = np.linalg.norm(lift[:, :2] - (0.6, 0.3), axis=1)
     near = np.linalg.norm(lift[:, :2] - (0.5, -0.3), axis=1)
-    # The corners of the way are rounded off, so the way may be a little too low near them.
+    # The path's corners are rounded off, so the path may be a little too low near them.
     assert lift[(away > 0.007) & (near > 0.021), 2].min() > state.travel_z - 0.004
     assert lift[-1, 2] == pytest.approx(state.place_hover_z)
     for mode, goal in ((Mode.DESCEND, (0.6, 0.3)), (Mode.LOWER, (0.5, -0.3))):

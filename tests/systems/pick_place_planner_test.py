@@ -458,7 +458,7 @@ def test_no_search_is_made(touched: float, insertion: bool, amplitude: float):
 
 
 def test_an_object_placed_on_the_table_is_released_without_a_search():
-    """Even in insertion tasks, because the table has no cavity."""
+    """There is no search even in insertion tasks, because the table has no cavity."""
     run = Run(World(touch_place=GRASP_Z), insertion=True).finish()
     assert run.sequence == [*PICK_AND_PLACE, Mode.OBSERVE, Mode.DONE]
 
@@ -711,7 +711,7 @@ def test_motion_is_smooth_and_within_the_limits_of_its_mode(answer: PickPlaceAct
         assert abs(v[3]) <= p.yaw_speed * 1.0001
         assert abs(a[3]) <= p.yaw_acceleration * 1.0001
         turning = max(turning, abs(v[3]))
-    # Motions are as fast as the limits allow.
+    # LOWER begins faster than `contact_speed`. The long carry and the long turn reach their limits.
     assert fastest[Mode.LOWER] > 1.2 * p.contact_speed
     if answer is FAR:
         assert fastest[Mode.CARRY] == pytest.approx(p.carry_speed, rel=1e-2)

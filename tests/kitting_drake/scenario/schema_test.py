@@ -30,7 +30,7 @@ them."""
 
 def reachable(kind: Any) -> set[type]:
     """The dataclasses of the schema that can occur in a value of a type, including the type."""
-    if kind is PythonTask:  # `own_task_test` covers it.
+    if kind is PythonTask:  # `own_task_test` covers own tasks.
         return set()
     if dataclasses.is_dataclass(kind):
         hints = typing.get_type_hints(kind)

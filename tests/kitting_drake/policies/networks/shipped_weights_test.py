@@ -70,7 +70,7 @@ def test_no_test_seed_was_used_in_training(path: Path):
 
 
 def test_stops_when_all_tools_are_in_the_kit():
-    """One of the observations was made after a demonstration with a validation seed (20011)."""
+    """The final observation was made after the demonstration of a validation seed, 20011."""
     networks = load_networks(MODELS / "policies" / "kitting_unseen.safetensors")
     policy = LearnedPolicy(networks, orientations=36)
     names = ("kitting_unseen_final", "kitting_unseen")

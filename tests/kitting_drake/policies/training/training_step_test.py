@@ -126,7 +126,7 @@ def test_one_step_in_eight_has_a_final_observation():
 
 
 def rates(learner: Trainer) -> set[float]:
-    """The learning rates of the next step."""
+    """All learning rates of the trainer's optimisers, as set for the next step."""
     return {group["lr"] for item in learner.optimisers.values() for group in item.param_groups}
 
 
