@@ -176,7 +176,7 @@ def _most_tested_run(runs: list[Run]) -> list[str]:
             ],
             placed,
         ),
-        "Errors of the policy's actions from the annotated grasp and the goal: median and "
+        "Errors of the policy's actions relative to the annotated grasp and the goal: median and "
         "95th percentile.\n",
         markdown_table(["category", "pick, mm", "pick, deg", "place, mm", "place, deg"], acted),
     ]
@@ -261,6 +261,6 @@ def _runs_table(runs: Sequence[Run]) -> str:
         ]
         for run in runs
     ]
-    headings = ["name", "task", "run", "training steps", "episodes", "seeds", "hours, summed"]
+    headings = ["name", "task", "run", "training steps", "episodes", "seeds", "core hours"]
     headings += ["weights", "commit"]
     return markdown_table(headings, rows, left_columns=3)

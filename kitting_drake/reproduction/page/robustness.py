@@ -80,20 +80,20 @@ def robustness_table(runs: Sequence[Run]) -> str:
         )
     if any(_is_other_level(label) for label, _ in common):
         parts.append(
-            f"The other levels were run on at least the first {_FEWEST} of these seeds. Each cell "
-            "ends with the number of objects:\n\n"
+            f"Levels `mild` and `severe` were run on at least the first {_FEWEST} of these seeds. "
+            "Each cell ends with the number of objects:\n\n"
             + _table(common, [label for label in expected if _is_other_level(label)], counted=True)
         )
     needless = _needless_table(common, list(expected))
     if needless:
         parts.append(
-            "Some actions were on objects that have no cavity, such as boxes. The table has the "
-            "number of these\nactions, out of all actions in these runs. Success rates do not "
+            "Some actions were on objects that have no cavity, such as boxes. The next table has "
+            "the number of these\nactions, out of all actions in these runs. Success rates do not "
             "include these objects:\n\n" + needless
         )
     if further:
         parts.append(
-            "The last table has the cells that were run on more seeds, with all their seeds. "
+            "The last table has the perturbations that were run on more seeds, with all seeds. "
             "Each cell ends with the number of objects:\n\n"
             + _table(found, [label for label in expected if label in further], counted=True)
         )

@@ -14,7 +14,7 @@ from kitting_drake.reproduction.paper.cells import PRESET
 from kitting_drake.reproduction.paper.failed_grasps import changeable, is_as_in_the_paper
 
 _NOT_MEASURED = (
-    ("physics and cameras", "another simulator", "Drake, hydroelastic contact; its own cameras"),
+    ("physics and cameras", "another simulator", "Drake: hydroelastic contact, rendered cameras"),
     ("speed of the floating hand", "not given", "faster than an arm could move it"),
     ("rim of a cavity", "not given", "a lead-in bevel of 1 mm"),
     ("friction of a kit", "not given", "0.3"),
@@ -26,24 +26,32 @@ _NOT_MEASURED = (
     (
         "fingers, on the pyramid",
         "not given",
-        "15 mm thick, in a gap of 10 mm: along a row they push the next cube",
+        "15 mm thick, but cubes are 10 mm apart: jaws that open along a row push the next cube",
     ),
-    ("release, in cells marked `e`", "the jaws open by 5 mm in all", "by 12 mm in all"),
+    ("release, in cells marked `e`", "the gap between the jaws grows by 5 mm", "it grows by 12 mm"),
     ("open jaws, place red in green, cells marked `e`", "50 mm apart", "80 mm apart"),
-    ("demonstrated picks, in cells marked `e`", "off the middle along one axis", "at the middle"),
+    (
+        "demonstrated picks, in cells marked `e`",
+        "off the object's middle, along one axis",
+        "at the object's middle",
+    ),
     (
         "size of the networks",
         "as given (preset `paper`)",
-        f"preset `{PRESET}`: ours has 1/25 of the parameters, the Transporter 1/70",
+        f"preset `{PRESET}`: our networks have 1/25 of the parameters, the Transporter's 1/70",
     ),
-    ("label", "one-hot", "shared among neighbouring pixels and orientations"),
-    ("search for a place", "one correlation", "first at half the resolution, with its own loss"),
+    ("labels", "one pixel and orientation", "shared among neighbouring pixels and orientations"),
+    (
+        "search for a place",
+        "one correlation",
+        "a correlation at half the resolution, with its own loss; then a full one near its maxima",
+    ),
     (
         "random shift of training scenes",
         "not given",
-        "standard deviation: a sixth of each side (Ravens: of the shorter side)",
+        "standard deviation: a sixth of each side of the image (Ravens: of its shorter side)",
     ),
-    ("alpha", "the paper's classes", 'one more class, "nothing to pick"'),
+    ("classes of alpha", "the pixels", 'the pixels and "nothing to pick"'),
     ("checkpoint", "the best on the test runs", "the best on separate validation scenes"),
     (
         "the Transporter's rotations",
@@ -53,7 +61,7 @@ _NOT_MEASURED = (
     (
         "learning rate",
         "0.0001 for every method",
-        "0.001 for ours, the best of three for each baseline",
+        "0.001 for our method, the best of three for each baseline",
     ),
 )
 """The differences whose effect was not measured: name, the paper's or Ravens' way, and ours."""
@@ -67,12 +75,12 @@ def departures(results: Mapping[str, Result]) -> str:
     """
     measured = [
         (
-            "steps",
-            "10,000 at one rate",
-            "1000 to 3000; the rate rises, then falls",
+            "training steps",
+            "10,000, at one learning rate",
+            "1000 to 3000; the learning rate rises, then falls",
             _compared(
                 results,
-                "with three times the steps, ours, pyramid",
+                "our method on the pyramid, with three times the steps",
                 {
                     f"N = {n}": (f"{name}_3_times_the_steps", name)
                     for n in (180, 36)

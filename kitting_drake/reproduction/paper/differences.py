@@ -106,7 +106,10 @@ def _rivals(cell: Cell) -> list[tuple[str, str]]:
         ]
     if cell.label == "generalist":
         others = [label for label in SHIPPED if label != cell.label]
-        return [(label.replace("_", " "), f"{cell.task}_{label}") for label in others]
+        return [
+            (label.replace("_", " ").replace("of 100", "trained on 100"), f"{cell.task}_{label}")
+            for label in others
+        ]
     if not isinstance(training, Training) or training.method != "so2":
         return []
     if cell.label.startswith("minus"):

@@ -21,12 +21,12 @@ _TEXT = f"""\
 #### Parameters of every network
 
 The table has the trainable parameters at N = {ORIENTATIONS}. The only picking network of the
-Transporter, f_pick, is under alpha. The last column has the ratio to the original's parameters. For
-both baselines, the original is our preset `paper`.
+Transporter, f_pick, is under alpha. The *ratio* compares all networks with those of the original
+method. For both baselines, our preset `paper` stands for the original.
 
-The presets `small` and `matched` differ in the baselines only. Our networks are 25 times smaller
-than the paper's. In `matched`, so is the Transporter, and the pick-angle network (beta) of the
-Equivariant Transporter has about as many parameters as ours.
+The presets `small` and `matched` differ in the baselines only. In both, our networks are 25 times
+smaller than the paper's. In `matched`, so is the Transporter, and the pick-angle network (beta) of
+the Equivariant Transporter has about as many parameters as ours.
 
 The parameters of the originals come from these sources:
 

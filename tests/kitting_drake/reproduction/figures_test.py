@@ -157,7 +157,7 @@ def test_the_sentences_of_the_readme(runs: dict[str, Summary], readme: str):
         100 * np.mean([item["success_rate"] for item in runs[name]["outcomes"]])
         for name in ("stack_block_pyramid_so2_36_100", "stack_block_pyramid_so2_36_100_ours")
     )
-    assert f"reach {plain:.1f} % as in the paper, and {extended:.1f} % with refined" in text
+    assert f"reach {plain:.1f} % by the paper's rules, and {extended:.1f} % with refined" in text
     red = [percent(runs, f"place_red_in_green_so2_{n}_1") for n in (36, 180)]
     assert f"place red in green ({red[0]} and {red[1]} %, at N = 36 and 180)" in text
     rows_of = json.loads((RESULTS / "networks.json").read_text())["pick_angle"]

@@ -81,7 +81,7 @@ def test_runs_on_other_seeds_are_pooled_in_another_table():
 def test_other_levels_use_the_first_seeds_and_show_their_number():
     first = run("mass:severe", 0.5, seeds=SAME[:12])
     table = robustness_table([run(None, 1.0), first, run("mass:mild", 1.0, seeds=SAME[:5])])
-    _, levels = table.split("The other levels")
+    _, levels = table.split("Levels `mild` and `severe`")
     levels, pooled = levels.split("The last table has")
     assert rows(levels)["`mass:severe`"][2] == "50.0 (36 to 64), 48"
     assert "`mass:mild`" not in levels
