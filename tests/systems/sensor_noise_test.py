@@ -254,8 +254,8 @@ def test_pose_errors_have_their_own_random_streams(
 ):
     """No other stream [seed, ...] may give the same numbers.
 
-    Scenes use [seed] and [seed, k] with small k, the rest of a cell larger k. NumPy pads seeds with
-    zeros, so [seed, 15, 0] equals [seed, 15].
+    Scenes use [seed] and [seed, k] with small k. Other random values use larger k. NumPy pads seeds
+    with zeros, so [seed, 15, 0] equals [seed, 15].
     """
     shift = error(7).translation()
     shift = shift / np.linalg.norm(shift)

@@ -102,7 +102,7 @@ def test_a_models_friction_is_scaled_and_its_meshes_are_found(tmp_path: Path):
     assert "<mass>0.1805997838</mass>" in tool
     assert "mu_static>0.25<" in tool
     assert f"file://{MODELS / 'tools' / 'claw_hammer' / 'steel.obj'}" in tool
-    # Such characters may be in a folder's name. They must stay, because Drake does not decode URIs.
+    # Special characters in a folder's name stay as they are, because Drake does not decode URIs.
     folder = tmp_path / "ä b#c%20d"
     shutil.copytree(MODELS / "tools" / "claw_hammer", folder)
     plant, _ = AddMultibodyPlantSceneGraph(DiagramBuilder(), time_step=0.01)
@@ -120,7 +120,8 @@ def test_the_text_of_an_unvaried_model_is_that_of_its_file(tmp_path: Path):
     text = model_text(hammer)
     assert text is not None
     assert re.findall(r"<(mass|ixx|pose|size)>([^<]*)<", text) == numbers
-    # For these files no text is returned, so that Drake reads them itself.
+    # For a damaged SDFormat file, one that includes another, and a URDF, no text is returned. Drake
+    # then reads the file itself.
     other = tmp_path / "other.sdf"
     for content in ("<sdf", "<sdf><include><uri>hammer.sdf</uri></include></sdf>"):
         other.write_text(content)

@@ -27,8 +27,8 @@ def visibility(unseen: tuple[slice, slice], *, in_view: bool) -> Visibility:
 @pytest.mark.parametrize(
     ("unseen", "in_view", "theta", "good"),
     [
-        # Unseen within the view: the pick; below a finger; the same, but the hand is turned away;
-        # a small part below a finger.
+        # Pixels within the view are unseen: at the pick; below a finger; beside the turned hand;
+        # in a small part below a finger.
         ((slice(78, 83), slice(158, 163)), True, 0.0, False),
         ((slice(75, 86), slice(172, 180)), True, 0.0, False),
         ((slice(75, 86), slice(172, 180)), True, np.pi / 2, True),
