@@ -1,0 +1,111 @@
+"""Writes the table of `docs/robustness.md` about scenes that are harder than the tidy table."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from kitting_drake.reproduction.page.markdown import markdown_table
+from kitting_drake.reproduction.page.runs import Run
+
+_POLICIES = {"generalist": "generalist", "shape_matching": "shape matching", "oracle": "oracle"}
+
+
+@dataclass(frozen=True)
+class _Row:
+    """A row of the table."""
+
+    label: str
+    scenario: str
+    """The scenario's file and name, as in a summary."""
+    perturbed: bool = False
+    """Whether all perturbations are applied, at the level `moderate`."""
+    own_shapes: bool = True
+    """Whether the shapes of `!AssemblingKits` are those of this project."""
+
+
+_ROWS = (
+    _Row("unseen toolsets", "kitting_unseen:KittingUnseenToolsets"),
+    _Row(
+        "unseen toolsets, `--perturb all:moderate`",
+        "kitting_unseen:KittingUnseenToolsets",
+        perturbed=True,
+    ),
+    _Row("pairs of tools that touch", "heaps:touching"),
+    _Row("pairs of tools, one across the other", "heaps:crossed"),
+    _Row("half of the tools lean on others", "heaps:leaning"),
+    _Row("a heap of four tools", "heaps:heap"),
+    _Row("parts of 15 to 60 mm", "small_parts:SmallParts"),
+    _Row("rings, plates, discs, boards and cylinders", "small_parts:RingsPlatesCylinders"),
+    _Row("tools of 250 to 330 mm", "large_tools:LargeTools"),
+    _Row("tools of 1 to 2 kg", "large_tools:HeavyTools"),
+    _Row("two kits", "raised_kits:TwoKits"),
+    _Row("a kit on a riser, tilted by 3 degrees", "raised_kits:TiltedKit"),
+    _Row("five flat shapes of ours in a kit", "assembling_kits:Test"),
+    _Row("five of Ravens' fourteen shapes in a kit", "assembling_kits:Test", own_shapes=False),
+)
+
+
+_TEXT = """
+## Harder scenes
+
+Each cell has 25 episodes on seeds that nobody had looked at before. Both policies have `recover: true` and the
+shipped weights, and every task but the last two has at least two tries per tool. The oracle knows all poses; it
+shows that the scenes can be solved. *Force* is the contact force of the generalist's actions: 95 % are below the first
+number, and none is above the second. The last column counts the generalist's episodes that ended with the right
+[reason](architecture.md#why-an-episode-ends).
+
+"""
+
+
+def harder_scenes_text(runs: Sequence[Run]) -> str:
+    """Writes the section: strict success of each policy, the generalist's largest forces, and how
+    often its reason to stop was right. It is empty if there are no runs.
+
+    Args:
+        runs: all runs. The runs of the table have names that begin with `scenes_`.
+    """
+    chosen = [run for run in runs if run.name.startswith("scenes_")]
+    rows = []
+    for row in _ROWS:
+        found = {run.method: run.summary for run in chosen if _is_of(run, row)}
+        if not found:
+            continue
+        shown = found.get("generalist")
+        rows.append(
+            [
+                row.label,
+                *(_strict(found[key]) if key in found else "-" for key in _POLICIES),
+                _forces(shown) if shown else "-",
+                _reasons(shown) if shown else "-",
+            ]
+        )
+    if not rows:
+        return ""
+    headings = ["scene", *_POLICIES.values(), "force, N", "right reasons to stop"]
+    return _TEXT + markdown_table(headings, rows)
+
+
+def _is_of(run: Run, row: _Row) -> bool:
+    scenario: dict[str, Any] = run.summary["resolved_scenario"]
+    return (
+        run.summary["scenario"] == row.scenario
+        and bool(scenario["sensor_noise"]["depth_std"]) == row.perturbed
+        and (not scenario["task"].get("shapes")) == row.own_shapes
+    )
+
+
+def _strict(summary: dict[str, Any]) -> str:
+    low, high = summary["strict_ci95"]
+    rate = summary["strict_success_rate"]
+    return f"{100 * rate:.1f} ({100 * low:.0f} to {100 * high:.0f})"
+
+
+def _forces(summary: dict[str, Any]) -> str:
+    forces = summary["peak_force_n"]
+    return f"{forces['p95']:.0f}, {forces['max']:.0f}"
+
+
+def _reasons(summary: dict[str, Any]) -> str:
+    counts = summary["stop_reasons"].values()
+    right = sum(count["right"] for count in counts)
+    return f"{right} of {right + sum(count['wrong'] for count in counts)}"
