@@ -1,0 +1,64 @@
+"""The table of harder scenes: each run stands in the row of its scenario, in its policy's column."""
+
+from typing import Any
+
+from kitting_drake.reproduction.page.harder_scenes import harder_scenes_text
+from kitting_drake.reproduction.page.runs import Run
+
+
+def run(name: str, scenario: str, method: str, share: float, **scene: Any) -> Run:
+    resolved = {"task": {}, "sensor_noise": {"depth_std": 0.0}} | scene
+    summary = {
+        "policy": method,
+        "policy_details": {"method": method},
+        "scenario": scenario,
+        "resolved_scenario": resolved,
+        "strict_success_rate": share,
+        "strict_ci95": [share - 0.05, share + 0.02],
+        "peak_force_n": {"median": 4.0, "p95": 12.4, "max": 29.6},
+        "stop_reasons": {"done": {"right": 21, "wrong": 1}, "gave up": {"right": 3, "wrong": 0}},
+    }
+    if method == "generalist":
+        summary["policy_details"] = {"method": "so2", "scenario": "static scenes"}
+    return Run(name, summary)
+
+
+def rows(text: str) -> dict[str, list[str]]:
+    lines = [line.strip("| ").split("|") for line in text.splitlines() if line.startswith("|")]
+    return {line[0].strip(): [cell.strip() for cell in line[1:]] for line in lines}
+
+
+def test_each_run_is_in_its_row():
+    noise = {"sensor_noise": {"depth_std": 0.001}}
+    unseen = "kitting_unseen:KittingUnseenToolsets"
+    shapes = {"task": {"shapes": "folder"}}
+    table = rows(
+        harder_scenes_text(
+            [
+                run("scenes_heap", "heaps:heap", "generalist", 0.75),
+                run("scenes_heap_matching", "heaps:heap", "shape_matching", 0.5),
+                run("scenes_unseen", unseen, "generalist", 0.98),
+                run("scenes_moderate", unseen, "generalist", 0.94, **noise),
+                run("scenes_public", "assembling_kits:Test", "oracle", 0.97, **shapes),
+                run("other_heap", "heaps:crossed", "generalist", 0.1),
+            ]
+        )
+    )
+    assert table["a heap of four tools"] == [
+        "75.0 (70 to 77)",
+        "50.0 (45 to 52)",
+        "-",
+        "12, 30",
+        "24 of 25",
+    ]
+    assert table["unseen toolsets"][0].startswith("98.0")
+    assert table["unseen toolsets, `--perturb all:moderate`"][0].startswith("94.0")
+    public = table["five of Ravens' fourteen shapes in a kit"]
+    assert public[:2] == ["-", "-"]
+    assert public[2].startswith("97.0")
+    assert public[3:] == ["-", "-"]
+    assert not any("one across" in label for label in table)
+
+
+def test_without_runs_there_is_no_section():
+    assert harder_scenes_text([]) == ""
