@@ -48,10 +48,11 @@ _ROWS = (
 _TEXT = """
 ## Harder scenes
 
-Each cell has 25 episodes on seeds that nobody had looked at before. Both policies have `recover: true` and the
-shipped weights, and every task but the last two has at least two tries per tool. The oracle knows all poses; it
-shows that the scenes can be solved. *Force* is the contact force of the generalist's actions: 95 % are below the first
-number, and none is above the second. The last column counts the generalist's episodes that ended with the right
+Each cell has 25 episodes on seeds that nobody had looked at before. Both policies have
+`recover: true` and the shipped weights, and every task but the last two has at least two tries per
+tool. The oracle knows all poses; its column shows that the scenes can be solved. The column of
+forces has two contact forces of the generalist's actions: 95 % are below the first, and none is
+above the second. The last column counts the generalist's episodes that ended with the right
 [reason](commands.md).
 
 """
