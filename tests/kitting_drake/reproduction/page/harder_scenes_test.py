@@ -1,4 +1,4 @@
-"""The table of harder scenes: each run stands in the row of its scenario, in its policy's column."""
+"""The table of harder scenes: each run is in its scenario's row and its policy's column."""
 
 from typing import Any
 
