@@ -29,8 +29,8 @@ holds for paths with only one corner."""
 _FEWEST, _MOST = 40, 200
 """Least and largest number of points of a path."""
 _TRIES, _PATIENCE = 8, 3
-"""A path that crosses too low is raised at most `_TRIES` times; after `_PATIENCE` tries, by more
-each time."""
+"""If a path crosses too low, a higher one is tried. At most `_TRIES` paths are tried. After try
+number `_PATIENCE`, counted from 0, the raises grow."""
 _ANY_ACCELERATION = 1e3
 """Acceleration of the yaw on a straight line, in rad/s^2. It is so large that only the joints'
 limits matter."""

@@ -1,4 +1,4 @@
-"""Finds, from true poses, which objects lie on others and which grasps nothing obstructs."""
+"""Finds, from true poses, which objects lie on others and which grasps are unobstructed."""
 
 from __future__ import annotations
 
@@ -73,8 +73,8 @@ class HeldFromAbove:
     gripper: PlanarPose
     """The gripper's pose in the world."""
     top: float
-    """World z of the top of the part between the pads, in metres; `bottom` is that of its
-    underside."""
+    """World z of the top of the part between the pads, in metres. `bottom` is the world z of this
+    part's underside."""
     bottom: float
     lowest: float
     """World z of the whole object's lowest point, in metres."""
@@ -176,10 +176,9 @@ class ClutteredTable:
             poses: X_WB of each object.
             points: the surface points of each object in the world.
             failed: gripper poses of earlier failed picks, in the world.
-            ignores_fixtures: whether fixtures do not count as obstructions. Set it for an object
+            ignores_fixtures: whether to ignore fixtures that are in the way. Set it for an object
                 that lies in a cavity.
-            steepest: grasps on faces that are tilted by more than this, in radians, from the
-                vertical are left out.
+            steepest: the largest angle between a gripped face and the vertical, in radians.
         """
         around = [item for other, item in enumerate(points) if other != index]
         if not ignores_fixtures:
@@ -330,8 +329,8 @@ def _in_hand(points: Points, gripper: PlanarPose) -> tuple[Points, Points]:
 
 
 def _gripper_pose(X_WB: RigidTransform, grasp: Grasp, steepest: float) -> PlanarPose | None:
-    """The gripper's pose in the world; None if the gripped faces are tilted by more than
-    `steepest`."""
+    """The gripper's pose in the world; None if the angle between the gripped faces and the vertical
+    exceeds `steepest`."""
     R = X_WB.rotation().matrix()
     across = R @ np.array([-math.sin(grasp.theta), math.cos(grasp.theta), 0.0])
     if abs(across[2]) > math.sin(steepest):

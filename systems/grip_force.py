@@ -16,8 +16,8 @@ _MOMENT_ARM = 0.0030
 """While the hand accelerates, the pads hold a moment up to their force times this length, in m. A
 long round handle begins to turn if the moment exceeds the force times 5 mm."""
 _HELD_MOMENT = 0.30
-"""If an object with a smaller moment, in N m, does not turn between the pads at rest, it will not
-turn in motion."""
+"""If an object with a smaller moment, in N m, does not turn between the pads while the hand rests,
+it will not turn in motion."""
 _NOTABLE_MOMENT = 0.10
 """A moment that a poor grip might not hold, in N m."""
 _INDULGENCE = 0.5
@@ -29,8 +29,8 @@ _SOFT, _SOFT_SHARE = 0.006, 0.2
 """If the jaws sink farther into an object than `_SOFT`, in m, or than `_SOFT_SHARE` of its width,
 they press less."""
 _MUCH_LESS = 0.85
-"""If the jaws sink into an object, their force is lowered only to at most this fraction of the
-present force."""
+"""If the jaws sink into an object, their force is lowered only if the new force is at most this
+fraction of the present force."""
 _GENTLE, _GENTLEST = 0.5, 0.25
 """Fractions of the acceleration limits. An object that may turn is moved with at most `_GENTLE` of
 them; no object is moved with less than `_GENTLEST` of them."""
@@ -176,7 +176,8 @@ def turns_in_the_pads(moment: float, times: float) -> bool:
 
 
 def slips_when_carried(moment: float, times: float) -> bool:
-    """Whether an object that does not turn between the pads at rest may turn when it is carried.
+    """Whether an object may turn between the pads when it is carried, even if it does not turn
+    while the hand rests.
 
     The arguments are those of `turns_in_the_pads`.
     """

@@ -17,8 +17,8 @@ released. The unit is the width with which the object lies on the block."""
 _MOST_OUTSIDE = 0.008
 """Largest distance of the centre of mass outside the edge, in metres."""
 _BESIDE = 0.005
-"""Along the edge, the object must rest on the block at least this far to both sides of its centre
-of mass, in metres."""
+"""The object must rest on the block on both sides of its centre of mass: at points that are more
+than this away from it along the edge, in metres."""
 _FROM_CORNER = 0.02
 """Distance of the centre of mass from the block's corner along the edge, in metres. The object then
 reaches beyond the corner, where the hand can grip it again."""

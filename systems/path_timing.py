@@ -7,8 +7,9 @@ and u. One pass backwards finds the largest x from which the end can be reached,
 takes the largest u.
 
 `SmoothMotion` averages such a motion over the last few milliseconds. This limits the jerk. All
-other limits still hold, because they are convex: the average of states within the limits is also
-within them. For the velocity limits this is true because they are concave in the position.
+other limits still hold: the states that they allow form a convex set, and the average of states in
+a convex set is also in the set. For velocities the set is convex because the largest velocity is a
+concave function of the position.
 """
 
 from __future__ import annotations

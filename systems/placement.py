@@ -32,7 +32,7 @@ GONE = 10.0
 appeared yet."""
 
 _FAR = 0.5
-"""Larger displacements, in metres, count as this one when objects are assigned to goals."""
+"""When objects are assigned to goals, displacements are capped at this, in metres."""
 _NEAR = 0.05
 """Objects farther than this from a goal, in metres, are assigned without a test whether they fill
 it."""
@@ -119,7 +119,7 @@ class Placement:
     goal: int | None = None
     """Index of the goal; None if no goal is left for the object."""
     pose: int = 0
-    """Index, among the goal's poses, of the one nearest to the object."""
+    """Index, in `Goal.poses`, of the pose that is nearest to the object."""
     add_s: float = math.inf
     """ADD-S, equation 9 of the paper, in metres."""
     position_error: float = math.inf

@@ -29,9 +29,9 @@ its place is within `_SAME_PLACE` of the best rotation's place."""
 _SAME_PLACE = 4.0
 """The largest distance, in pixels, between the places of rotations that count as equally good."""
 _TRIES = 4
-"""The policy stops after this many picks that are not seen well enough."""
+"""The policy stops after this many proposals whose pick or place is not seen well enough."""
 _ANOTHER = 0.010
-"""After a pick that is not seen well enough, the next is farther away than this, in metres."""
+"""The next pick is farther than this, in metres, from a pick that is not seen well enough."""
 _NOTHING_FITS = 2.0
 """How much the stop threshold is raised if the outlines show nothing to pick, in nats.
 

@@ -30,7 +30,7 @@ any y."""
 _GRID = 100
 """Number of points to check along each side of the workspace."""
 _BORDER = 0.015
-"""A border of the workspace of this width, in m, may be hidden: no object fits into it."""
+"""The workspace's border, of this width in m, may be hidden: it is too narrow for an object."""
 
 
 def hidden_table_note(scenario: Scenario) -> str | None:

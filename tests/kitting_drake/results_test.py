@@ -174,7 +174,7 @@ def test_a_run_is_the_papers_only_if_nothing_but_the_policy_differs(
 
 
 def test_a_field_that_a_run_did_not_have_is_a_difference(tmp_path: Path):
-    """A run that lacks a field may have had another value than the field's default."""
+    """A run that lacks a field may have used a value other than the default."""
     write(tmp_path, "run", Scenario(task=ToolsetKitting()), [1.0])
     found = read_summaries(tmp_path)["run"]["resolved_scenario"]
     del found["task"]["random_lengths"]

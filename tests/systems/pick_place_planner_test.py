@@ -804,7 +804,7 @@ def test_a_load_pressed_at_the_end_of_a_carry_is_no_payload():
     touched = HANGING + GUARDED.hover_clearance + 0.002
     run = Run(World(touch_place=touched, stiffness=SOFT), parameters=GUARDED).until(Mode.RELEASE)
     assert run.output("desired_motion")[2] == pytest.approx(touched - 0.002, abs=1e-3)
-    # The peak force is that of 2 mm at 2 kN/m, without the payload.
+    # Pressing 2 mm deep at 2 kN/m takes 4 N. The payload does not count.
     assert run.output("peak_force")[0] == pytest.approx(4.0, abs=0.5)
 
 

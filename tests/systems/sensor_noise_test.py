@@ -292,7 +292,8 @@ def test_calibration_errors_have_the_given_sizes():
         believed(number, rig_position_error=0.003, rig_angle_error_deg=0.3) @ POSE.inverse()
         for number in (0, 1)
     ]
-    # All cameras have the same error of the rig, whose rotation is about the workspace's middle.
+    # The error of the rig is the same for all cameras: it moves the workspace's middle, and rotates
+    # the rig about this point.
     assert rig[0].IsNearlyEqualTo(rig[1], 1e-12)
     assert np.linalg.norm(rig[0] @ np.array([0.5, 0, 0]) - (0.5, 0, 0)) == pytest.approx(0.003)
     angle = rig[0].rotation().ToAngleAxis().angle()

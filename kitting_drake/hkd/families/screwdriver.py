@@ -36,8 +36,8 @@ class ScrewdriverParameters:
     # The width across flats and the length of the hexagon on the shaft; length 0 for none.
     bolster_width_mm: float = 11.0
     bolster_length_mm: float = 9.0
-    # The handle's length, its width across its flats, and by how much it is narrower at the neck
-    # behind the guard.
+    # The handle's length, its width across flats, and the difference between this width and the
+    # width of the neck behind the guard.
     handle_length_mm: float = 105.0
     handle_width_mm: float = 28.0
     neck_depth_mm: float = 3.5

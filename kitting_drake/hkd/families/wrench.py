@@ -122,8 +122,8 @@ def _shoulders(p: WrenchParameters, head: Head, side: int) -> CrossSection:
 def _shank_cells(p: WrenchParameters) -> list[CrossSection]:
     """Returns regions that cut the shank into convex parts.
 
-    They leave out what a head covers. The list is empty if the shank is straight and a head has no
-    shoulders; tails and spikes need none.
+    They leave out what a head covers. The list is empty if the shank is straight and a head that
+    needs shoulders has none. Tails and spikes need no shoulders.
     """
     half, far = p.center_distance_mm / 2, 100.0
     if p.swing_mm:

@@ -189,8 +189,8 @@ class _Warp:
     stretch: Array
     """The factors (2,) along y and z."""
     splay: float
-    """The fraction by which the end toward +x is wider than the middle, and the other end narrower;
-    negative for the opposite."""
+    """The factor of the width is 1 + splay at the end toward +x, 1 in the middle, and 1 - splay at
+    the other end."""
     bend: Array
     """The sideways offset is bend[0] u^2 + bend[1] u^3, in half lengths of the tool. At the ends of
     the tool, u is -1 and 1."""

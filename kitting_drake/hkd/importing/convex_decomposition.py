@@ -160,7 +160,7 @@ def _steps(shares: np.ndarray) -> list[float]:
     values, counts = np.unique(np.round(within, 3), return_counts=True)
     order = np.argsort(-counts, kind="stable")[:3]
     many = max(4, len(shares) // 50)
-    # The values are rounded, so return the median of the exact positions near each.
+    # The values are rounded. For each one, return the median of the exact positions near it.
     return [
         float(np.median(within[np.abs(within - values[i]) <= 6e-4]))
         for i in order

@@ -19,11 +19,10 @@ was picked or placed there."""
 _MOST_TRIES = 3
 """The largest number of actions on one object."""
 _LEAST_SHARE = 0.5
-"""A region smaller than this share of the smallest open recess's area contains no object for an
-open recess."""
+"""A region that contains an object for an open recess has at least this share of the smallest open
+recess's area."""
 _LARGEST_SHARE = 1.6
-"""A region larger than this multiple of the open recesses' total area does not consist of objects
-for these recesses."""
+"""A region of objects for open recesses has at most this multiple of these recesses' total area."""
 
 
 @dataclass(frozen=True)

@@ -163,7 +163,7 @@ def _grip(
     planner: PickPlaceParameters,
     support: float,
 ) -> list[JawGrasp]:
-    """Returns those of n grasps, at positions (n, 2) and angles (n,), that are feasible."""
+    """Returns the feasible ones of n grasps, at positions (n, 2) and angles (n,)."""
     raised = ndimage.maximum_filter(relief, 3)
     top = raised[tuple(np.rint(places).astype(int).T)].astype(float)
     tip = tip_height(top, support, planner)

@@ -53,11 +53,11 @@ _UNEXPLAINED = 0.15
 """If the objects found in a region leave more than this share of its area uncovered, they must all
 agree clearly with the region's outline (`_CLEARLY`)."""
 _CLEARLY = 0.65
-"""An object's outline agrees clearly with the region's outline if at least this share of the
-object's outline is shared."""
+"""An object's outline agrees clearly with the region's outline if at least this fraction of the
+object's outline coincides with it."""
 _LEAST_PART = 0.35
-"""A region whose area is less than this share of a recess's area contains no object of that
-recess."""
+"""A region can contain an object of a recess only if its area exceeds this share of the recess's
+area."""
 _HIGHER = 0.006
 """Pixels that are higher than an object's median height by more than this, in metres, belong to
 something that lies on the object."""
@@ -65,11 +65,11 @@ _ACROSS = 6
 """Something lies across an object's outline if at least this many of its pixels are inside the
 outline, and as many outside."""
 _SLIVER = 1
-"""What remains of a region after objects are cut out is eroded by this many pixels, to drop
-slivers."""
+"""After objects are cut out of a region, the remaining parts are eroded by this many pixels, to
+drop slivers."""
 _LEAST_REST = 0.0002
-"""What remains of a region after objects are cut out is an object if its area is at least this, in
-square metres."""
+"""After objects are cut out of a region, a remaining part counts as an object if its area is at
+least this, in square metres."""
 
 
 @dataclass(frozen=True)
@@ -154,8 +154,8 @@ def _split(
 
 
 def _rest(rest: Mask, relief: NDArray[np.float32], resolution: float) -> list[Region]:
-    """Returns the objects in `rest`, which remains of a region after objects are cut out. Slivers
-    are dropped."""
+    """Returns the objects in `rest`, the remaining parts of a region after objects are cut out.
+    Slivers are dropped."""
     core = ndimage.binary_erosion(rest, iterations=_SLIVER)
     labels, count = ndimage.label(ndimage.binary_propagation(core, mask=rest))
     regions = (labels == number for number in range(1, count + 1))

@@ -58,11 +58,11 @@ not part of the table."""
 _TALL = 1.2
 """Points that are higher above the table than this, in metres, are ignored."""
 _CLOSED = 0.035
-"""Half the width, in metres, of the widest gap in the table that is closed. Gaps come from objects
-and shadows."""
+"""Gaps in the table are closed if they are narrower than twice this, in metres. Such gaps come from
+objects and shadows."""
 _KIT = 0.03
-"""Half the least width, in metres, of an object at the table's edge that counts as part of the
-table. Narrower things, such as profiles along the edge, do not count."""
+"""An object at the table's edge counts as part of the table if it is at least twice this wide, in
+metres. Narrower things, such as profiles along the edge, do not count."""
 _LEAST_TALL = 0.02
 """The width below which tall things count as noise, in metres."""
 _AROUND = 0.02

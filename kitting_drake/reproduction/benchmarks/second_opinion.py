@@ -34,7 +34,7 @@ _FRICTION = 0.375
 use the larger one."""
 
 _MOST_FRUITLESS = 5
-"""The number of episodes in a row without a release after which the benchmark fails."""
+"""The benchmark fails after this many episodes in a row without a release."""
 
 
 @dataclass(frozen=True)

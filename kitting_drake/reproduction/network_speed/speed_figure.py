@@ -143,8 +143,8 @@ def _label(
     quantity: str,
     text: Callable[[float], str],
 ) -> None:
-    """Writes a point's value above the point. The lowest of several points at one N has its value
-    below it."""
+    """Writes a point's value below the point if it is the lowest of several at one N, else above
+    the point."""
     there = [other[quantity] for other in rows if other["orientations"] == row["orientations"]]
     below = len(there) > 1 and row[quantity] == min(there)
     axis.annotate(

@@ -42,7 +42,7 @@ class Timing:
 
 
 def read_clock(device: torch.device) -> float:
-    """Returns the time in seconds after the device has finished all its work."""
+    """Waits until the device has finished all its work, then reads the clock, in seconds."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
     return time.perf_counter()

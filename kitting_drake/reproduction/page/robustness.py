@@ -32,7 +32,7 @@ _FRAMES = 5
 _SEEDS = range(2870, 2895)
 """The seeds of every cell of the first table. They were not used before these runs."""
 _FEWEST = 12
-"""Runs at other levels than moderate have at least this many of `_SEEDS`, from the first one on."""
+"""Runs at the levels mild and severe use at least this many seeds: the first ones of `_SEEDS`."""
 
 Key = tuple[str, str]
 """The label of a row of the table, and a method."""
@@ -42,9 +42,9 @@ def robustness_table(runs: Sequence[Run]) -> str:
     """Writes the tables of strict success on unseen toolsets.
 
     Policies have two tries per tool and may recover. All runs of the first table use the same
-    seeds. The second table has the levels other than moderate, on the first of these seeds. The
-    last table has the cells that ran on more seeds, with all their seeds, because a selection could
-    flatter the policy.
+    seeds. The second table has the levels mild and severe, on at least the first `_FEWEST` of these
+    seeds. The last table has the cells that ran on more seeds, with all their seeds, because a
+    selection could flatter the policy.
 
     Args:
         runs: all runs. Runs of other scenarios, and runs with other weights than the shipped ones,

@@ -148,8 +148,8 @@ class Training:
     demonstrations: int
     seed: int = 0
     learning_rate: float | None = None
-    """The learning rate. If None, it is the first of `LEARNING_RATES` for the SO(2) method, and the
-    best one of the `reference` for a baseline."""
+    """The learning rate. For the SO(2) method, None stands for the first of `LEARNING_RATES`; for a
+    baseline, it stands for the best rate of the `reference`."""
     taken_only: bool = True
     """Whether only the action that was taken is a label, as in the paper."""
     rigid: bool = True
@@ -174,8 +174,8 @@ class Training:
 
     @property
     def steps(self) -> int:
-        """The number of steps. It is the same for all methods, as in the paper, and larger for
-        trainings with more labels or augmentation than the paper."""
+        """The number of steps. It is the same for all methods, as in the paper. Trainings with more
+        labels or augmentation than in the paper have more steps."""
         task = TASKS[self.task]
         more = 0 if self.taken_only and self.rigid else task.more_steps
         return self.times * (task.steps + more)

@@ -82,7 +82,7 @@ def _figure_6() -> list[Cell]:
 
 
 def _checks() -> list[Cell]:
-    """Returns cells whose networks are all trained at the N of the test."""
+    """Returns cells that are tested at N = 36, with all networks trained at this N."""
     trainings = [
         *(Training(task, "so2", 36, 100) for task in FIGURE_6),
         Training("unseen", "equivariant_transporter", 36, 100),
@@ -135,7 +135,7 @@ def _headline_seeds() -> list[Cell]:
 
 
 def _ablation() -> list[Cell]:
-    """Returns cells with our extensions, with recovery too, and with one extension left out."""
+    """Returns cells with our extensions: all, all with recovery, or with some left out."""
 
     def ours(task: str, label: str, **changes: Any) -> Cell:
         kept = ("taken_only", "rigid")

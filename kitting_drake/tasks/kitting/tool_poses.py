@@ -22,7 +22,8 @@ _RESTARTS = 60
 _DISTRACTOR_SPACING = 0.01
 """Least distance of a drawn box from anything else, in metres."""
 _MANY = 6
-"""If there are more tools than this, large tools are drawn before small ones."""
+"""If there are more tools than this, the poses of large tools are drawn before those of small
+ones."""
 
 
 @dataclass

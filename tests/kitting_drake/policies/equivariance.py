@@ -35,7 +35,10 @@ def rotate_image(image: Tensor, degrees: float) -> Tensor:
 
 
 def relative_error(found: Tensor, expected: Tensor) -> float:
-    """The norm of the difference in a disc inside the images, relative to their variation there."""
+    """The norm of the difference, relative to the norm of the expected image's variation.
+
+    Only the pixels of a disc inside the images count.
+    """
     disc = distance_from_middle(expected.shape[-1]) < 0.7
     variation = expected[..., disc] - expected[..., disc].mean(-1, keepdim=True)
     return float((found - expected)[..., disc].norm() / variation.norm())

@@ -62,7 +62,7 @@ def half_up(value: float) -> int:
 
 
 def counts(found: list[Summary], least: int = STRICT) -> tuple[int, int]:
-    """The number of successful objects, and the number of all objects."""
+    """The number of objects whose outcome is at least `least`, and the number of all objects."""
     ends = [end for run in found for item in run["outcomes"] for end in item["objects"].values()]
     return sum(end >= least for end in ends), len(ends)
 
@@ -76,7 +76,7 @@ def wilson(good: int, objects: int) -> tuple[float, float]:
 
 
 def share(found: list[Summary], least: int = STRICT) -> str:
-    """The share of objects that were placed, with at least the outcome `least`, and its interval.
+    """The percentage of objects whose outcome is at least `least`, and its interval.
 
     In the format of README.md.
     """

@@ -119,7 +119,7 @@ def test_one_of_everything():
     seen: set[type] = set()
     for name in ONE_OF_EVERYTHING:
         loaded = load_scenario(TEST_SCENARIOS, name)
-        # The first scenario gives all fields but those that the others cover.
+        # Only the first scenario must give all fields of `Scenario`.
         whole = name == "OneOfEverything"
         seen |= check_given(Scenario, root[name], loaded, Scenario(), name, whole=whole)
     assert seen >= reachable(Scenario) - reachable(Task) - reachable(Policy)

@@ -39,8 +39,8 @@ _LEAST_PROTRUDING = 0.00012
 """The least area of a protruding object, in square metres. It is small, because an object may
 protrude only at one end."""
 _USUAL_PIXEL = 0.003125
-"""The side of the pixels, in metres, for which the least areas are chosen. Noise affects a few
-pixels of any size, so the least areas are reduced for smaller pixels."""
+"""The least areas are chosen for pixels with this side, in metres. They are reduced for smaller
+pixels, because noise affects a few pixels, whatever their size."""
 _CLOSING = 0.0094
 """Gaps in a plateau are closed if they are narrower than twice this, in metres."""
 CLEAN = 0.0005

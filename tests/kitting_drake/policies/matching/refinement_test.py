@@ -33,9 +33,9 @@ def bar(blocked: float) -> Segmentation:
     [(66, 0.0, 0), (60, 0.0, 1), (60, 0.45, 1), (40, 0.45, None)],
 )
 def test_a_refined_grasp_is_near_the_predicted_one(row: int, blocked: float, moves: int | None):
-    """A nearly optimal grasp stays and another one moves along the bar, but not far.
+    """A nearly optimal grasp stays. Any other grasp moves along the bar, but not far.
 
-    If there is no good grasp nearby, None is returned, so that the network's own is used.
+    If there is no good grasp nearby, None is returned; the policy then uses the network's grasp.
     """
     found, pick = bar(blocked), np.array([row, 160.0])
     [region] = [item for item in found.objects if item.mask[100, 160]]

@@ -31,7 +31,7 @@ EDGE: Box = ((0.30, 0.70), (-0.33, -0.30), TABLE + 0.03)
 
 
 def camera(degrees: float = 35.0) -> Calibration:
-    """A camera 1.1 m from the table, at which it looks from `degrees` off the vertical."""
+    """A camera that looks at the table from 1.1 m away, `degrees` off the vertical."""
     angle = math.radians(degrees)
     X = np.eye(4)
     # The image's x axis (to the right) points along the base's +y; the camera looks back towards

@@ -23,9 +23,9 @@ from kitting_drake.reproduction.benchmarks.reliability_report import (
 
 
 def drawn(policy: str, seed: int) -> list[Judged]:
-    """Random decisions, which are the more often right the better the fit.
+    """Random decisions. The better the fit, the more of them are right.
 
-    In turn, their scenes have three random cameras, one, or the default ones.
+    Their scenes have, in turn, the default cameras, one random camera, or three random cameras.
     """
     random = np.random.default_rng(seed)
     names = read_reliability(policy).weights

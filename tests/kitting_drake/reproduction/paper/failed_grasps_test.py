@@ -1,4 +1,4 @@
-"""How many actions of a run the memory of failed grasps can have changed: a number or a range."""
+"""The number of a run's actions that the memory of failed grasps can have changed, or its range."""
 
 from typing import Any
 
@@ -28,7 +28,7 @@ def test_without_failed_grasps_nothing_changes():
 
 def test_a_failed_grasp_precedes_at_most_three_of_four_actions():
     assert changeable(summary([GOOD, GOOD, ONE_LOST], 1, actions=12)).text == "0 to 3 of 12"
-    # If an episode has two failures, at least one action comes after a failure: the second one.
+    # The episode has two failures. The action that fails second comes after the first failure.
     assert changeable(summary([[0, 0, 2, 2]], 1, 1, actions=4)).text == "1 to 3 of 4"
 
 
@@ -37,7 +37,7 @@ def test_placed_objects_took_their_own_actions():
     found = changeable(summary([[2] * 6, [2, 2, 2, 2, 2, 0]], 2, actions=14, **pyramid))
     assert found.text == "0 to 12 of 14"
     found = changeable(summary([[2] * 6, [2, 2, 2, 2, 2, 0]], 1, actions=14, **pyramid))
-    # At least five of the fourteen actions placed the cubes of the episode without a failure.
+    # One episode has no failure. At least five of the fourteen actions placed its cubes.
     assert found.text == "0 to 8 of 14"
     assert changeable(summary([[2] * 6], 1, **pyramid)).text == "0 to 11 of 12"
 

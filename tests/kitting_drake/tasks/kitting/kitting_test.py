@@ -58,7 +58,7 @@ def test_the_seed_determines_the_scene():
 
 
 def test_poses_and_goals_follow_the_order():
-    """If the order is random, each tool still has the pose and the cavity of the listed order."""
+    """In a random order, each tool has the same pose and cavity as in the listed order."""
     scene, listed = draw(0), draw(0, Kitting(random_order=False))
     assert names(listed) == Kitting().tools
     assert names(scene) != Kitting().tools
