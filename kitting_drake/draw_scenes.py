@@ -135,8 +135,8 @@ class _Parts:
             if self._gapless() >= count:
                 return None
             batch = next(i for i in range(_MOST_BATCHES) if i not in begun)
-            # Begin no further batch if the scenes will suffice once the missing batches are
-            # complete.
+            # Begin no other batch if enough scenes exist, and every batch missing between them has
+            # begun.
             if sum(self._counts.values()) >= count and batch > max(self._counts):
                 return None
             begun.add(batch)

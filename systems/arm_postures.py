@@ -32,8 +32,8 @@ _CHECKED = 12
 _JUMP = 1.5
 """Largest allowed change of a joint while the hand moves straight up or down, in rad."""
 _TILTS = (math.radians(2.0), math.radians(20.0), math.pi)
-"""Limits of the hand's tilt between two stops, in rad. The smallest one that allows a motion is
-used, because one end of a long object hangs lower if the hand tilts."""
+"""Limits of the hand's tilt between two stops, in rad. The smallest limit that allows a motion is
+used: if the hand tilts, one end of a long object hangs lower."""
 _PLANAR = 1e-6
 """If the swivel is smaller than this, in rad, the arm counts as lying in the vertical plane."""
 

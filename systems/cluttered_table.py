@@ -1,4 +1,4 @@
-"""Finds, from true poses, which objects lie on others and which grasps are unobstructed."""
+"""Finds, from true poses, which objects lie on others and how obstructed each grasp is."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ _LEAST_SQUARES = 2
 _FLAT = math.radians(2.5)
 """An object tilted by less than this, in radians, lies flat."""
 _SAME_SHAPE = 0.0003
-"""Two surfaces count as equal if the mean distance between their points exceeds 1.1 times the
-points' spacing by less than this, in metres."""
+"""Two surfaces count as equal if the mean distance between their points is less than this, in
+metres, plus 1.1 times the points' spacing."""
 _ROLLED = math.radians(20.0)
 """Only a tilt of at least this, in radians, counts as caused by rolling."""
 _ROLLED_PITCH = math.radians(10.0)
@@ -154,8 +154,8 @@ class ClutteredTable:
         yaws = yaw + np.linspace(-_ROLLED_PITCH, _ROLLED_PITCH, 21)
         deviations = [_deviation(item, points, float(angle)) for angle in yaws]
         best = int(np.argmin(deviations))
-        # The points of two samples of the same surface are as far apart as the points of one
-        # sample.
+        # If the surfaces are equal, the points of one are about as far from those of the other as
+        # neighbouring points of one surface are from each other.
         spacing = float(item.tree.query(item.p_BPoints, k=2)[0][:, 1].mean())
         return float(yaws[best]) if deviations[best] < 1.1 * spacing + _SAME_SHAPE else None
 

@@ -16,8 +16,8 @@ _MOMENT_ARM = 0.0030
 """While the hand accelerates, the pads hold a moment up to their force times this length, in m. A
 long round handle begins to turn if the moment exceeds the force times 5 mm."""
 _HELD_MOMENT = 0.30
-"""If an object with a smaller moment, in N m, does not turn between the pads while the hand rests,
-it will not turn in motion."""
+"""An object that does not turn between the pads at rest may turn in motion if its moment is larger
+than this, in N m."""
 _NOTABLE_MOMENT = 0.10
 """A moment that a poor grip might not hold, in N m."""
 _INDULGENCE = 0.5
@@ -35,8 +35,8 @@ _GENTLE, _GENTLEST = 0.5, 0.25
 """Fractions of the acceleration limits. An object that may turn is moved with at most `_GENTLE` of
 them; no object is moved with less than `_GENTLEST` of them."""
 _GENTLER = 0.8
-"""A motion is restarted when its acceleration should be less than this fraction of the present
-one."""
+"""The acceleration is lowered only to less than this fraction of the present one, because each
+change restarts the motion."""
 _LEAST_CHANGE = 1.05
 """The force rises only in steps of at least this factor, so that noise does not restart its
 ramp."""

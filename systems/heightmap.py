@@ -35,9 +35,9 @@ class DepthRays(NamedTuple):
     v: NDArray[np.float32]
     """(height, 1), or (height, width): y of each pixel's ray at depth 1."""
     min_depth: float
-    """Smaller depths are invalid, in metres."""
+    """The least valid depth, in metres."""
     max_depth: float
-    """Larger depths are invalid, in metres."""
+    """The largest valid depth, in metres."""
 
     @staticmethod
     def from_pinhole(
@@ -193,8 +193,8 @@ def _see(view: View, grid: PixelGrid) -> NDArray[np.float32]:
 
 
 def _sortable(values: NDArray[np.float32]) -> NDArray[np.int32]:
-    """Maps float32 numbers to int32 numbers that have the same order. Applied to its own result,
-    viewed as float32, the function returns the bits of the original numbers."""
+    """Maps float32 numbers to int32 numbers that have the same order. The function is its own
+    inverse: applied to its result, viewed as float32, it returns the bits of the original."""
     bits = values.view(np.int32)
     return np.where(bits < 0, bits ^ np.int32(0x7FFFFFFF), bits)
 

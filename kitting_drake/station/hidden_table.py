@@ -23,7 +23,7 @@ from systems.hand_geometry import (
 from systems.signals import PixelGrid
 
 _YAWS = np.deg2rad([0.0, 45.0, 90.0, 135.0])
-"""Yaws of the waiting hand to check, relative to that of the home pose, in rad."""
+"""Yaws at which the waiting hand is checked, relative to the yaw of the home pose, in rad."""
 _PLACES = 9
 """Number of waiting positions to check along the workspace's y axis, because the hand may wait at
 any y."""

@@ -81,7 +81,7 @@ def _goal_problems(
 
 
 def _first_problem(stops: Iterable[HandStop], motion: ArmMotion) -> str:
-    """Says why an arm cannot reach the first of the stops; empty if it reaches any stop."""
+    """Says why an arm cannot reach the first stop; empty if it can reach at least one stop."""
     first = ""
     for stop in stops:
         problem = reach_problem(motion.postures, [stop])

@@ -346,7 +346,7 @@ class KittingStation(Diagram):
                 self._arm_path.correct(self.plant, context, state, bodies)
 
     def _let_appear(self, root_context: Context) -> None:
-        """Moves an object that is to appear now to its place on the table."""
+        """If an object is to appear now, moves it to its place on the table."""
         if self._feeder is None:
             return
         port = self._feeder.get_output_port()
@@ -487,7 +487,7 @@ def _check_on_table(scene: Scene) -> None:
 def _surface_groups(
     scene: Scene, still_bodies: Sequence[BodyIndex], objects: Sequence[PlacedObject]
 ) -> dict[BodyIndex, str]:
-    """For each body, how its surfaces' names in a scenario's `appearance` begin: `table`,
+    """For each body, the prefix of its surfaces' names in a scenario's `appearance`: `table`,
     `fixtures/NAME` or `objects/NAME`."""
     groups = {still_bodies[0]: "table"}
     for fixture, body in zip(scene.fixtures, still_bodies[1:], strict=True):

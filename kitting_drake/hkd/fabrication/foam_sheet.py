@@ -165,7 +165,8 @@ def fill_sheet(
 def _merit(places: Sequence[KitPlace], kits: Sequence[SheetKit]) -> tuple[int, float]:
     """Returns the number of different kits on the sheet, and the area in mm^2 that kits cover.
 
-    The better of two packings has more different kits or, if the numbers are equal, covers more.
+    Of two packings, the better one has the larger number or, if the numbers are equal, the larger
+    area.
     """
     present = len({place.kit for place in places})
     return present, sum(math.prod(kits[place.kit].size) for place in places)

@@ -74,7 +74,7 @@ def _square(width: float, height: float, flute: float) -> np.ndarray:
 
 
 def _octagon(width: float, height: float, flute: float) -> np.ndarray:
-    """Returns an octagon, as of planed wood."""
+    """Returns the octagonal section of a planed wooden handle."""
     y, z = width / 2, height / 2
     a, b = 0.42 * y, 0.42 * z
     corners = [(-a, -z), (a, -z), (y, -b), (y, b), (a, z), (-a, z), (-y, b), (-y, -b)]

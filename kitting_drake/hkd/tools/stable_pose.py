@@ -46,7 +46,7 @@ def stable_poses(points: Array, center_of_mass: Array) -> list[StablePose]:
     """Returns the stable poses of a body, in a deterministic order.
 
     Args:
-        points: points (n, 3) in the body's frame B whose convex hull is that of the body.
+        points: points (n, 3) in the body's frame B, with the same convex hull as the body.
         center_of_mass: the centre of mass (3,) in B.
 
     Raises:

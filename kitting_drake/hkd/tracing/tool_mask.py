@@ -17,17 +17,19 @@ _NO_SHADOW = 1.3
 _BALL_MM = 0.9
 """The radius of the disc that `_reached` rolls over the ground, in mm."""
 _ROUGH = 0.022
-"""The roughness up to which any surface counts as even for `MIDDLE`, in logarithms of light."""
+"""For `MIDDLE`, any surface counts as even if its roughness, in logarithms of light, is at most
+this."""
 _MOST_FINE = 0.1
 _HOLE_BALL_MM = 0.6
 _STRIP_MM = 1.2
-"""Half the width, in mm, up to which an eroded region in `_shaded_holes` counts as a strip."""
+"""An eroded region in `_shaded_holes` counts as a strip if half its width is at most this, in
+mm."""
 _EDGE_MM = 2.3
 """The distance by which the ground is extended over the rough pixels at an edge, in mm."""
 _SHINE_STEEP = 0.6
 """The largest slope of the edge of a specular reflection, in logarithms of light per mm."""
 _STEP_REACH_MM = 1.5
-"""The distance from a pixel within which a step of light is measured, in mm."""
+"""The radius around a pixel, in mm, of the area in which a step of light is measured."""
 _SHINY, _SHINY_SHARE = 0.06, 0.25
 """How much brighter than the ground a reflection is, in logarithms of light; and the least share of
 a bay or hole of a tool's mask that must be so bright."""
@@ -42,7 +44,7 @@ region that must be brighter than the ground."""
 _BAY_MM = 12.0
 """Half the largest width, in mm, of the bays and holes that may be reflections."""
 _BLENDED_MM, _SHADED = 1.2, 0.06
-"""The width of a step of light, in mm, above which a tool blends into its surroundings; and the
+"""The least width, in mm, of a step of light at which a tool blends into its surroundings; and the
 least darkness of a shadow, in logarithms of light."""
 _NEUTRAL = 0.05
 """The largest difference in colour between shaded and lit ground, in logarithms of light."""
@@ -211,8 +213,8 @@ class ToolMasks:
     def _without_shine(self, tool: Array, widest: float) -> Array:
         """Fills the bays and holes of a mask that are reflections on a tool.
 
-        Their border with the tool is soft, or they are brighter than the ground. `widest` is the
-        largest width in mm of a step of light that is not soft.
+        Their border with the tool is soft, or they are brighter than the ground. A step of light
+        that is wider than `widest`, in mm, is soft.
         """
         cv2, px_per_mm = self._cv2, self._px_per_mm
         closed = _closed(cv2, tool, _BAY_MM * px_per_mm, px_per_mm)
@@ -246,8 +248,8 @@ class ToolMasks:
         image = ((np.clip(-self._smooth, -0.3, 2.25) + 0.3) * 100).astype(np.uint8)
         cv2.watershed(np.ascontiguousarray(image), markers)
         mask = (markers == 2).astype(np.uint8)
-        # The watershed's lines belong to neither side. Assign each of their pixels to the side with
-        # more of its neighbours.
+        # The watershed's lines belong to neither side. Assign each of their pixels to the side that
+        # has more of the neighbouring pixels.
         mask[(markers == -1) & (cv2.blur(mask.astype(np.float32), (3, 3)) > 0.4)] = 1
         return _cleaned(cv2, mask, self._evidence, px_per_mm)
 

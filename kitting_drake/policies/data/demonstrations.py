@@ -94,7 +94,7 @@ class Demonstrations:
 
 @dataclass(frozen=True)
 class Contents:
-    """The contents of a file without the demonstrations themselves."""
+    """The contents of a file of demonstrations, except the demonstrations themselves."""
 
     origin: Origin
     rejected: tuple[Rejection, ...]
@@ -123,7 +123,7 @@ def read_demonstrations(path: Path, first: int | None = None) -> Demonstrations:
 
 
 def read_contents(path: Path) -> Contents:
-    """Quickly reads the contents of a file without the demonstrations themselves.
+    """Quickly reads the contents of a file, except the demonstrations themselves.
 
     Raises:
         UserError: the file is unusable.

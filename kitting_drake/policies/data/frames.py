@@ -131,7 +131,7 @@ class EpisodeFrames:
 
 
 def read_frames(path: Path) -> EpisodeFrames:
-    """Reads a file of `EpisodeFrames.save`.
+    """Reads a file that `EpisodeFrames.save` wrote.
 
     Raises:
         UserError: the file is unusable.

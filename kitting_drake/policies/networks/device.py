@@ -31,7 +31,7 @@ def preferred_type() -> torch.dtype:
     convolution in both types.
     """
     if preferred_device().type == "cuda":
-        # Below compute capability 8 bfloat16 is emulated and slower.
+        # Below compute capability 8, bfloat16 is emulated and slower.
         native = torch.cuda.is_bf16_supported(including_emulation=False)
         return torch.bfloat16 if native else torch.float32
     if torch.backends.cpu.get_cpu_capability() not in ("AVX512", "AMX"):

@@ -35,12 +35,12 @@ class TableOutline:
     or the floor."""
 
     region: Polygon = ()
-    """A polygon around the table; empty if the table is everywhere."""
+    """A polygon around the table; empty if there is none."""
     ignore: tuple[Polygon, ...] = ()
     """Polygons in which there is no table."""
     mask: tuple[bytes, ...] = ()
     """One string of bytes for each row of the workspace: 1 for a pixel of the table, 0 for any
-    other. Empty if the table is everywhere."""
+    other. Empty if there is no mask."""
 
     def inside(self, grid: PixelGrid) -> NDArray[np.bool_] | None:
         """Returns a mask (rows, cols) of the pixels whose centres are on the table; None if there

@@ -15,7 +15,7 @@ from kitting_drake.real_camera.frames import Frame
 Array = NDArray[np.float64]
 
 FARTHEST = 0.15
-"""The largest distance of points above or below the table that may belong to it, in metres."""
+"""Points at most this far above or below the table's height, in metres, may belong to the table."""
 _TRIALS = 200
 _TRIED = 2000
 """The number of points on which a trial plane is scored."""

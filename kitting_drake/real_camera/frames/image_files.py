@@ -114,8 +114,8 @@ def read_npz(path: Path, depth_scale: float) -> tuple[NDArray[np.uint8], NDArray
 
 
 def depth_of_array(data: NDArray[Any], depth_scale: float, what: str) -> NDArray[np.float32]:
-    """Converts floats in metres, or whole steps of `depth_scale`, to depths (height, width) in
-    metres.
+    """Converts floats in metres, or integers in units of `depth_scale`, to depths (height, width)
+    in metres.
 
     Raises:
         UserError: the array has another shape or type.

@@ -28,9 +28,9 @@ _CLEARER = 16.0
 """Two poses are ambiguous if their sums of the corners' squared errors differ by less than this
 multiple of the error variance of one corner."""
 _LIKELY = 0.2
-"""The least error of corners, in pixels, that is assumed in the test for ambiguous poses."""
+"""The test for ambiguous poses assumes an error of the corners of at least this, in pixels."""
 _NOISE = 0.05
-"""The least error of corners, in pixels, that is assumed in computing `BoardFit.focal_error`."""
+"""`BoardFit.focal_error` assumes an error of the corners of at least this, in pixels."""
 _WORST = 3.0
 """The error of corners, in pixels, above which the lens is probably another one, or the board
 moved."""

@@ -112,8 +112,8 @@ def _shifted(pose: PlanarPose, offset: NDArray[np.float64]) -> PlanarPose:
 
 
 class _Adversary:
-    """An `EpisodeObserver` that makes the first action fail. It records the objects in their
-    cavities, and those of them that are picked again."""
+    """An `EpisodeObserver` that makes the first action fail. It also records which objects are in
+    their cavities, and which are picked again from there."""
 
     def __init__(
         self,

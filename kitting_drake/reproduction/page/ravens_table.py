@@ -44,8 +44,8 @@ PAPER: dict[tuple[str, int], tuple[tuple[float, float, float], ...]] = {
 
 
 def in_ravens_table(run: Run) -> bool:
-    """Whether the table has a run. The run must be of one of the five Ravens tasks, with its
-    default settings. Its policy must refine actions or have no networks."""
+    """Whether a run belongs in the table. It must be of one of the five Ravens tasks, with default
+    settings. Its policy must refine actions or have no networks."""
     if run.summary["task"] not in TASKS or run.departures:
         return False
     return run.method not in LEARNED or bool(run.detail("continuous"))

@@ -303,8 +303,8 @@ class Cell:
         if list(summary["seeds"]) != list(self.seeds):
             return f"its seeds are not {self.seeds[0]} to {self.seeds[-1]}"
         if isinstance(self.policy, str):
-            # Runs without the field avoid_failed_picks avoided failed picks. Leave out the names of
-            # weights, because weights are compared by their digest.
+            # Runs that lack the field avoid_failed_picks did avoid failed picks. Ignore the names
+            # of weights, because weights are compared by their digest.
             policies = (summary["resolved_scenario"]["policy"], expected["policy"])
             found, wanted = (
                 {"avoid_failed_picks": True} | policy | {"weights": ""} for policy in policies

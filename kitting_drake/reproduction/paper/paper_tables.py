@@ -48,8 +48,8 @@ method scores lower in our runs than in the paper, after ten or a hundred demons
 def _paper_cell(
     task: str, method: str, n: int, demonstrations: int, seed: int = 0, times: int = 1
 ) -> Cell:
-    # Networks that do not depend on N are trained once, at the largest N. These are all SO(2)
-    # networks, and all networks of the Equivariant Transporter but the pick-angle network.
+    # Networks that do not depend on N are trained once, at the largest N. These are every SO(2)
+    # network and, of the Equivariant Transporter, every network except the pick-angle network.
     # The cells of `_checks` measure the effect.
     trained_at = ORIENTATIONS[0] if method == "so2" else n
     shared = (
@@ -135,7 +135,7 @@ def _headline_seeds() -> list[Cell]:
 
 
 def _ablation() -> list[Cell]:
-    """Returns cells with our extensions: all, all with recovery, or with some left out."""
+    """Returns cells with all our extensions, with recovery in addition, or with some left out."""
 
     def ours(task: str, label: str, **changes: Any) -> Cell:
         kept = ("taken_only", "rigid")

@@ -23,17 +23,17 @@ PAPERS_MM = (
 )
 """Names of sheets of paper, and their sides in mm."""
 FRAMES = ("page", "tool")
-"""What a rectangle around all other curves of a drawing may be."""
+"""The possible meanings of a rectangle around all other curves of a drawing."""
 
 _JOIN_MM = 0.1
 """The largest gap between the ends of two curves that are joined, in mm."""
 _POINT_MM = 0.002
-"""The size in mm up to which a curve counts as a point, which is dropped."""
+"""A curve of at most this size, in mm, counts as a point and is dropped."""
 _SAME_MM = 0.05
-"""The distance in mm up to which two curves count as one curve that is drawn twice."""
+"""Two curves that are at most this far apart, in mm, count as one curve that is drawn twice."""
 _LEAST_AREA_MM2 = 1.0
 _LINE_MM = 1.5
-"""The width in mm below which two outlines count as the two sides of one thick line."""
+"""Two outlines count as the sides of one thick line if it is narrower than this, in mm."""
 _BOX = 0.9
 """A curve counts as a rectangle if it fills at least this share of its bounding box."""
 _THE_PAGE = "the page"

@@ -35,8 +35,8 @@ _OBJECT_HEIGHT = 0.003
 _PROTRUSION = 0.002
 """The largest height, in metres, by which a seated object rises above the fixture."""
 _FIXTURE_MARGIN = 0.006
-"""No object is found within this distance, in metres, outside the fixture's outline, and no recess
-within half this distance inside it."""
+"""The least distance, in metres, of an object from the fixture's outline. For a recess, which lies
+inside the outline, half this distance is enough."""
 _CLEARLY = 2.0
 """A height is not noise if it differs from a plane by more standard deviations than this.
 
@@ -165,9 +165,9 @@ class Segmentation:
     def _is_fragment(self, recess: Region) -> bool:
         """Whether a region is only a fragment of a filled recess.
 
-        The rest of a filled recess shows the object's top, slightly below the fixture's top, and is
-        larger than the fragment. In a free recess only narrow slots look so shallow, because no
-        camera sees their floor. They are smaller than the region.
+        If so, a larger area beside it lies slightly below the fixture's top: the top of the object
+        in the recess. In a free recess, only narrow slots look so shallow, because no camera sees
+        their floor. Such slots are smaller than the region.
         """
         if self.noise > CLEAN:
             return False
@@ -252,8 +252,7 @@ def segment(observation: Observation) -> Segmentation:
 
 
 def _is_corner(item: Region, fixture: Mask, top: float, resolution: float) -> bool:
-    """Whether a small region is a corner of the fixture that the fixture's convex hull does not
-    include."""
+    """Whether a small region is a corner of the fixture that the mask `fixture` misses."""
     if item.mask.sum() * resolution**2 >= LEAST_AREA or item.height < top - PLANE_BAND:
         return False
     near = ndimage.binary_dilation(item.mask, iterations=round(2 * _FIXTURE_MARGIN / resolution))
