@@ -80,7 +80,7 @@ class Tree:
     def _imported(
         self, name: Module, statements: Iterable[ast.AST]
     ) -> Iterator[tuple[Module, int]]:
-        """The imported modules, with line numbers, of the imports among a module's statements."""
+        """The modules, with line numbers, that some statements of a module import."""
         is_package = self.files[name].name == "__init__.py"
         package = name.split(".") if is_package else name.split(".")[:-1]
         for node in statements:

@@ -693,7 +693,8 @@ def test_a_nan_loss_ends_the_run(demos: Path, tmp_path: Path, monkeypatch: pytes
     assert not (tmp_path / "checkpoint.pt").exists()
 
 
-# Saves checkpoints often, and does not clip displacements, so that checkpoints differ in them.
+# Saves checkpoints often. Does not clip displacements, because all checkpoints would then score
+# alike.
 KILLABLE = """
 from kitting_drake import train
 from kitting_drake.policies.training import training_run, validation

@@ -46,13 +46,13 @@ def place(item: PlacedObject, target: Goal, X_WB: RigidTransform, success=None) 
 
 def test_add_s_of_a_small_translation_is_its_length():
     moved = RigidTransform([0.3, -0.4, 0.5])
-    # This translation is shorter than half the square's side, so the nearest point is the same one.
+    # The translation is shorter than half the square's side, so no other moved corner is nearer.
     assert add_s(SQUARE, RigidTransform(), moved) == pytest.approx(np.sqrt(0.5))
 
 
 def test_add_s_takes_the_nearest_point_not_the_same_point():
-    # Two goal points coincide with moved points, two are 2 from the nearest: (0 + 0 + 2 + 2) / 4.
-    # ADD would be 2.
+    # Two of the goal's corners coincide with moved corners. The nearest moved corner is 2 away from
+    # each of the other two: (0 + 0 + 2 + 2) / 4. ADD would be 2.
     assert add_s(SQUARE, RigidTransform(), RigidTransform([2.0, 0.0, 0.0])) == pytest.approx(1.0)
 
 

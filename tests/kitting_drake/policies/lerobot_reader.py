@@ -27,7 +27,8 @@ def differing(one: torch.Tensor, other: np.ndarray) -> int:
 
 
 def statistics_difference(dataset: LeRobotDataset, expected: dict[str, np.ndarray]) -> float:
-    """The largest difference from LeRobot's own statistics of the expected values."""
+    """The largest difference between the stored statistics and those that LeRobot computes from the
+    expected values."""
     values = {
         IMAGE: np.moveaxis(expected["image"], -1, 1) / 255,
         STATE: expected["state"].astype(np.float64),

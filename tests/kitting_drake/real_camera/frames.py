@@ -1,4 +1,4 @@
-"""Frames of the simulated cell's cameras in the form of a real bench's, and as files."""
+"""Makes frames like those of a real bench from the simulated cell, in memory or as files."""
 
 import dataclasses
 import math
@@ -47,7 +47,7 @@ class Rendered:
 
 
 def render(scenario: Scenario, seed: int, *, rig: Rig | None = None) -> Rendered:
-    """Renders the frames from which the cell's policy would decide first."""
+    """Renders the frames for the first decision of the cell's policy."""
     rig = rig or build_rig(scenario, seed=seed, base=ROOT / "scenarios")
     context = rig.diagram.CreateDefaultContext()
     frames, poses = take_frames(rig.station, rig.station.GetMyContextFromRoot(context))

@@ -34,8 +34,8 @@ def test_it_is_small_and_names_no_machine():
 def errors(action: PickPlaceAction) -> tuple[float, float, float]:
     """The errors of an action, judged by the nearest tool.
 
-    They are the distance between the pick and the tool (m), the distance between the action's place
-    and the one that brings the tool into a cavity (m), and the error of the tool's yaw (rad).
+    They are the distance of the pick from the tool (m), the distance of the action's place from the
+    place that brings the tool into a cavity (m), and the error of the tool's yaw (rad).
     """
     pick = np.array([action.pick.x, action.pick.y])
     found = []

@@ -24,8 +24,7 @@ ONE_OF_EVERYTHING = [
 
 SETTLED = {"start", "tray", "faces"}
 APART = {Learned: {"avoid_failed_picks"}, Kitting: SETTLED, ToolsetKitting: SETTLED}
-"""By class, the fields that cannot be given with others; `policies_test` and `starts_test` cover
-them."""
+"""For each class, the fields that exclude others; `policies_test` and `starts_test` cover them."""
 
 
 def reachable(kind: Any) -> set[type]:
@@ -45,7 +44,7 @@ def is_struct(value: Any) -> bool:
 
 
 def agrees(raw: Any, described: Any) -> bool:
-    """Whether the fields that YAML gives equal those in the description of a Drake config."""
+    """Whether the description of a Drake config contains all values of the YAML."""
     if not isinstance(raw, dict):
         return bool(raw == described)
     # YAML gives a rotation's only field without its name, `value`.

@@ -51,6 +51,6 @@ def test_a_waiting_arm_hides_more_than_its_hand():
 
 
 def test_the_hand_may_wait_at_any_y():
-    """The camera is over an end of the workspace, where the hand is not at first, but may wait."""
+    """The camera is over an end of the workspace. The hand begins elsewhere, but may wait there."""
     end = Pinhole(position=[0.5, -0.45, 1.1], rpy_deg=[180.0, 0.0, -90.0], focal_length=1500.0)
     assert hidden_table_note(Scenario(cameras={"end": end})) is not None

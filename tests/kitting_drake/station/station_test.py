@@ -280,7 +280,7 @@ def test_sleep_can_be_switched_off():
     root = advance(rig, 0.6, lambda root: asleep.append(locked(rig, root)))
     assert len(asleep) > 70
     assert not np.any(asleep)
-    assert rig.station.at_rest(root).all()  # Objects still count as resting.
+    assert rig.station.at_rest(root).all()  # They rest, but are not frozen.
 
 
 @pytest.mark.slow

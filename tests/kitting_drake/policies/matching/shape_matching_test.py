@@ -130,7 +130,7 @@ def test_stops_when_nothing_is_left(seen):
 
 
 def blind_networks() -> Networks:
-    """Networks that predict no pick on any object, but at a corner of the image."""
+    """Networks that always predict the pick at a corner of the image, where no object is."""
     networks = load_networks(GENERALIST)
     predict = networks.predict_pick
 

@@ -26,7 +26,7 @@ ONE_OF_THEM = [
 TAUGHT = [path for path in SHIPPED if path.stem != "generalist"]
 """The shipped weights that were trained on demonstrations: all but the generalist's."""
 OBSERVED = {"generalist": "kitting_unseen"}
-"""The stored observation of weights that have none of their own name.
+"""The stored observation for weights that have no observation of the same name.
 
 Observations were rendered with seeds 103 and 105, at rest, with four tools on the table.
 """

@@ -50,9 +50,9 @@ def make_scene(task: AssemblingKits, seed: int = 0) -> Scene:
 
 
 def measured(scene: Scene, index: int, offset: RigidTransform) -> dict[str, bool]:
-    """By measure, whether an object succeeds at an offset from its goal.
+    """For each measure of success, whether an object succeeds at an offset from its goal.
 
-    The task's own measure is `task`.
+    The task's own measure is called `task`.
     """
     goal = next(goal for goal in scene.goals if index in goal.objects)
     item = scene.objects[index]
