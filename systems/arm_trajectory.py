@@ -134,7 +134,7 @@ def quintic(
         v: (2, k) first derivatives at the two points.
         a: (2, k) second derivatives at the two points.
         step: time between the points, in s.
-        since: time since the first point at which to evaluate, in s.
+        since: time from the first point to the time of evaluation, in s.
     """
     # Subtract the parabola that continues the motion from the first point. The rest is a polynomial
     # in since / step with powers 3 to 5.

@@ -24,8 +24,8 @@ _SPACING = 0.010
 """Spacing of a path's points, in s: the time that the slowest joint takes from one to the next at
 full speed."""
 _ROUNDING, _WIDER = 0.15, 0.3
-"""Each corner of a path is rounded over this length, given as a time in s like `_SPACING`. `_WIDER`
-holds for paths with only one corner."""
+"""Length of the rounded part at each corner of a path, in s as `_SPACING`. `_WIDER` is for paths
+with only one corner."""
 _FEWEST, _MOST = 40, 200
 """Least and largest number of points of a path."""
 _TRIES, _PATIENCE = 8, 3
@@ -63,21 +63,21 @@ class WayVector(VectorView):
     """Two heights on the line. The hand slows down below the first, and once more below the
     second."""
     speeds = Array(3)
-    """Speeds of the line: above, between and below the marks."""
+    """Largest speeds of the hand on the line: above the marks, between them, and below them."""
     yaw_speed = Number()
     """Largest rate of the yaw on the line."""
     over = Array(JOINTS)
-    """Goal of a path that crosses: joint positions with the hand at or above the clear height. From
+    """Goal of an `over` path: joint positions with the hand at or above the clear height. From
     there the hand sinks to `sink`."""
     clear = Number()
     """Height of the fingertips above which the hand may travel."""
     sink = Number()
-    """Height to which the hand sinks at the end of a path that crosses."""
+    """Height to which the hand sinks at the end of an `over` path."""
     reach = Number()
     """How far a held object reaches to the side of the fingertips. The object's end hangs lower if
     the hand tilts."""
     speed = Number()
-    """Highest linear speed of the hand on a path that crosses. `acceleration` is the highest linear
+    """Highest linear speed of the hand on an `over` path. `acceleration` is the highest linear
     acceleration on any path."""
     acceleration = Number()
 

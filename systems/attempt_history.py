@@ -92,7 +92,7 @@ class AttemptHistory:
         return tuple(failed[-MOST_FAILED:])
 
     def set_downs(self, pick: PlanarPose) -> int:
-        """How many attempts set the object at a pick down again.
+        """How many attempts lifted the object at a pick and set it down again.
 
         Such an attempt measures the object's centre of mass first. It is counted if this centre is
         within `_SAME_OBJECT` of the pick.

@@ -73,9 +73,9 @@ class HeldFromAbove:
     gripper: PlanarPose
     """The gripper's pose in the world."""
     top: float
-    """World z of the top of the part between the pads, in metres. `bottom` is the world z of this
-    part's underside."""
+    """World z of the top of the part between the pads, in metres."""
     bottom: float
+    """World z of the underside of the part between the pads, in metres."""
     lowest: float
     """World z of the whole object's lowest point, in metres."""
     obstruction: int

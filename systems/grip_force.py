@@ -29,8 +29,8 @@ _SOFT, _SOFT_SHARE = 0.006, 0.2
 """If the jaws sink farther into an object than `_SOFT`, in m, or than `_SOFT_SHARE` of its width,
 they press less."""
 _MUCH_LESS = 0.85
-"""If the jaws sink into an object, their force is lowered only if the new force is at most this
-fraction of the present force."""
+"""If the jaws sink into an object, the force is lowered only if the new force is at most this
+fraction of the present one."""
 _GENTLE, _GENTLEST = 0.5, 0.25
 """Fractions of the acceleration limits. An object that may turn is moved with at most `_GENTLE` of
 them; no object is moved with less than `_GENTLEST` of them."""
@@ -112,8 +112,9 @@ def gentleness(
 ) -> float:
     """The fraction of the acceleration limits that is used to move an object of a given weight.
 
-    It is inversely proportional to the weight above `heavy_load`, and at most a half if the object
-    may turn between the pads. It never rises while the object is held.
+    It is 1 up to `heavy_load`. For heavier objects it is `heavy_load` / weight, but at least a
+    quarter. It is at most a half if the object may turn between the pads. It never rises while the
+    object is held.
 
     Args:
         weight: the weight that the hand feels, in N.

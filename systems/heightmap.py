@@ -35,9 +35,9 @@ class DepthRays(NamedTuple):
     v: NDArray[np.float32]
     """(height, 1), or (height, width): y of each pixel's ray at depth 1."""
     min_depth: float
-    """The least valid depth, in metres."""
+    """Smallest valid depth, in metres."""
     max_depth: float
-    """The largest valid depth, in metres."""
+    """Largest valid depth, in metres."""
 
     @staticmethod
     def from_pinhole(

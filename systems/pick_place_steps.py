@@ -129,7 +129,7 @@ class PickPlaceSteps:
             self._motion.begin(state, following, time)
 
     def descend(self, moment: Moment) -> None:
-        """Moves down until contact, or in an action that presses, until the press force is
+        """Moves down until contact. An action that presses goes on until the press force is
         reached."""
         state, time, hand, contact = moment.state, moment.time, moment.hand, moment.contact
         if state.press:

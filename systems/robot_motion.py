@@ -38,8 +38,7 @@ class RobotMotion(Protocol):
         place by equivalent ones.
 
         Returns:
-            Whether the robot can reach pick and place. A robot that cannot must not move in
-            `APPROACH`.
+            Whether the robot can reach pick and place. If not, it must not move in `APPROACH`.
         """
 
     def begin(
@@ -63,7 +62,8 @@ class RobotMotion(Protocol):
         """
 
     def back_off(self, state: PlannerState, distance: float) -> None:
-        """Raises the goal of the present mode, in which the hand moves straight, by a distance."""
+        """Raises the goal of the present mode by a distance. In this mode the hand must move
+        straight."""
 
     def slow_down(self, state: PlannerState, time: float, share: float) -> None:
         """Continues with less acceleration, in this mode and in later ones that move the object.

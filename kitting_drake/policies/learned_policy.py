@@ -207,8 +207,8 @@ def _outline_fields(draft: Draft) -> dict[str, Any]:
 
 
 def _place_margin(draft: Draft) -> float:
-    """Returns, in nats, how much higher the best place scores than the best place farther than
-    `_ELSEWHERE` from it."""
+    """Returns the score of the best place minus that of the best place elsewhere (see
+    `_ELSEWHERE`), in nats."""
     candidates = draft.placing.candidates
     best, _, row, col = candidates[0].best()
     others = [

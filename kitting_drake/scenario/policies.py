@@ -59,8 +59,8 @@ class PolicySite:
     """The base folder of relative paths in the scenario."""
     observer: DecisionObserver | None = None
     may_stop: bool = True
-    """Whether the policy may decide to stop. It may not if the episode ends as soon as every goal
-    is met (`end_at_success`)."""
+    """Whether the policy may decide to stop. False if the episode ends as soon as every goal is met
+    (`end_at_success`)."""
     planner: PickPlaceParameters = field(default_factory=PickPlaceParameters)
     """The parameters of the hand's motion."""
     has_cameras: bool = True

@@ -45,7 +45,7 @@ class ArmPath:
         state: NDArray[np.float64],
         bodies: Sequence[RigidBody],
     ) -> None:
-        """Moves the bodies that the hand carries onto the hand's arc. Call it once after each step.
+        """Moves carried bodies onto the hand's arc. Call it once after each step.
 
         Args:
             plant: the plant, which must be discrete.

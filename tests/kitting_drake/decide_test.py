@@ -56,7 +56,7 @@ def rendered(seed: int, policy: str) -> Rendered:
 
 
 def check_against_cell(seed: int, folder: Path, orientations: int = 180) -> None:
-    """Checks that the generalist decides on frames from files as in the cell.
+    """Checks that the generalist makes the same decision on frames from files as in the cell.
 
     With depths as .npy the decisions are bit-identical; as .png (whole mm) they are about equal.
     """

@@ -705,7 +705,7 @@ def test_motion_is_smooth_and_within_the_limits_of_its_mode(answer: PickPlaceAct
             assert speed <= speeds[mode] * 1.0001, mode
             assert acceleration <= accelerations[mode] * 1.0001, mode
             fastest[mode] = max(fastest.get(mode, 0.0), speed)
-        # Limits of the horizontal and vertical motion together.
+        # Limits of the combined horizontal and vertical motion.
         assert np.linalg.norm(v[:3]) <= 1.7
         assert np.linalg.norm(a[:3]) <= 13.0
         assert abs(v[3]) <= p.yaw_speed * 1.0001

@@ -87,7 +87,8 @@ def test_an_object_that_trembles_in_place_rests(metres: float, radians: float):
 
 @pytest.mark.parametrize(("metres", "radians"), [(0.1 * POSITION, 0.0), (0.0, 0.1 * ANGLE)])
 def test_an_object_that_creeps_does_not_rest(metres: float, radians: float):
-    """The creep is a tenth of the tolerance in 1/64 s: more than all of it in `time_to_sleep`."""
+    """The object creeps by a tenth of the tolerance in 1/64 s, so it exceeds the tolerance within
+    `time_to_sleep`."""
     table = Table()
     for _ in range(64):
         table.move_by(LEFT, metres, radians)

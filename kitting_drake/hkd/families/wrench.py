@@ -195,7 +195,8 @@ def _swung(p: WrenchParameters) -> np.ndarray:
 
 
 def _panel(p: WrenchParameters, side: int) -> Manifold:
-    """Builds the panel to subtract from or add to one broad side (+1 or -1) of the shank."""
+    """Builds the panel of one broad side (+1 or -1) of the shank. A recessed panel is to be
+    subtracted, a raised one to be added."""
     start = -p.center_distance_mm / 2 + 0.85 * p.back.diameter_mm
     end = p.center_distance_mm / 2 - 0.85 * p.front.diameter_mm
     half_start = 0.5 * p.panel_share * p.shank_width_back_mm

@@ -166,7 +166,7 @@ def _between(normals: Array, offsets: Array) -> CrossSection:
 
 
 def _needed(polygons: list[CrossSection], inner: CrossSection) -> list[CrossSection]:
-    """Drops polygons without which `inner` is still covered, the smallest first."""
+    """Drops polygons that are not needed to cover `inner`. Tries the smallest first."""
     kept = list(polygons)
     for polygon in sorted(polygons, key=CrossSection.area):
         rest = [other for other in kept if other is not polygon]

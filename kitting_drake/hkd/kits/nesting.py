@@ -51,7 +51,7 @@ class NestedShape:
     """A shape to place; lengths in metres."""
 
     outline: CrossSection
-    """The shape's outline, which keeps its distance from all other outlines."""
+    """The shape's outline. `nest` leaves a wall between any two outlines."""
     keep_out: CrossSection
     """A region that no other shape's outline may overlap. Such regions may overlap each other."""
 

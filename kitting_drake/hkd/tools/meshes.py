@@ -18,9 +18,9 @@ def vertices_and_faces(solid: Manifold) -> tuple[np.ndarray, np.ndarray]:
 def corner_normals(vertices: np.ndarray, faces: np.ndarray, crease_angle_deg: float) -> np.ndarray:
     """Computes normals (m, 3, 3) of the faces' corners, smooth across edges below the crease angle.
 
-    A corner's normal is the area-weighted mean of the normals of the faces at its vertex. Only
-    faces at less than the crease angle to the corner's own face count. Large flat faces therefore
-    stay flat beside narrow bevels.
+    A corner's normal is the area-weighted mean of the normals of the faces at its vertex. Faces
+    tilted from the corner's own face by the crease angle or more are left out. Large flat faces
+    therefore stay flat beside narrow bevels.
     """
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     weighted = np.cross(b - a, c - a)

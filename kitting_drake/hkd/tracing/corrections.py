@@ -15,10 +15,11 @@ _KINDS = ("add", "remove", "sheet")
 
 @dataclass(frozen=True)
 class Corrections:
-    """Polygons to add to and remove from the traced region, in order, and the sheet's corners."""
+    """The sheet's corners, and polygons to add to the traced region or to remove from it."""
 
     steps: tuple[tuple[str, NDArray[np.float64]], ...] = ()
-    """Pairs of `add` or `remove`, and a polygon (n, 2) in mm, as on the rulers of `trace.png`."""
+    """The polygons, in the order in which they are applied: each is `add` or `remove`, and points
+    (n, 2) in mm, as on the rulers of `trace.png`."""
     corners: NDArray[np.float64] | None = None
     """The sheet's corners (4, 2) in pixels of the photo, counter-clockwise in the picture. None:
     the corners are found automatically."""

@@ -22,8 +22,7 @@ this."""
 _MOST_FINE = 0.1
 _HOLE_BALL_MM = 0.6
 _STRIP_MM = 1.2
-"""An eroded region in `_shaded_holes` counts as a strip if half its width is at most this, in
-mm."""
+"""An eroded region in `_shaded_holes` counts as a strip if it is at most twice this wide, in mm."""
 _EDGE_MM = 2.3
 """The distance by which the ground is extended over the rough pixels at an edge, in mm."""
 _SHINE_STEEP = 0.6
@@ -42,7 +41,7 @@ _GLARE_REACH_MM, _GLARE_GAP_MM, _GLARE_MM2, _GLARE_SHARE = 8.0, 2.5, 0.7, 0.25
 strip between them. In mm^2: the least area of an added region. As a share: the least part of this
 region that must be brighter than the ground."""
 _BAY_MM = 12.0
-"""Half the largest width, in mm, of the bays and holes that may be reflections."""
+"""Bays and holes up to twice this wide, in mm, may be reflections."""
 _BLENDED_MM, _SHADED = 1.2, 0.06
 """The least width, in mm, of a step of light at which a tool blends into its surroundings; and the
 least darkness of a shadow, in logarithms of light."""
@@ -80,7 +79,7 @@ differs from that for other limits, the outline is in doubt."""
 _LOW_MM = 9.0
 _COARSE_PX_PER_MM = 3.5
 _FINE_PX_PER_MM = 5.0
-"""Below this resolution, blurred pixels widen the steps of light, so the limits of their width are
+"""Below this resolution, blur widens the steps of light, so the limits of a step's width are
 raised."""
 
 
@@ -268,7 +267,7 @@ def _lightness_and_colour(cv2: Any, logs: Array) -> tuple[Array, Array]:
 
 
 def _steepness(cv2: Any, smooth: Array, px_per_mm: float) -> Array:
-    """Returns the largest slope (rows, columns) of the three colour channels, per mm."""
+    """Returns (rows, columns): at each pixel, the largest slope of the three channels, per mm."""
     steep = np.zeros(smooth.shape[:2], np.float32)
     for k in range(3):
         x = cv2.Sobel(smooth[..., k], cv2.CV_32F, 1, 0, scale=px_per_mm / 8)

@@ -81,8 +81,8 @@ class LabelledImage:
     def curved_crop(self, index: int, pixel: tuple[int, int], side: int) -> Image:
         """Returns a crop in which the object is bent (curvature augmentation).
 
-        Let u be the distance from the pick along the gripper's angle, in half sides of the crop. A
-        curvature (a, b) shifts the image at u across that direction by a u^2 + b u^3 half sides.
+        The unit of length is half the side of the crop. At the distance u from the pick along the
+        gripper's angle, a curvature (a, b) shifts the image sideways by a u^2 + b u^3.
         Position and direction at the pick stay the same, so the label remains exact, while the
         object's far ends become less informative.
 

@@ -133,10 +133,10 @@ class Inventory:
         return any(item is region for item in self.reversed_items)
 
     def is_tried(self, region: Region | None) -> bool:
-        """Whether an object should not be tried again. For None the result is False.
+        """Whether an object was tried often enough. For None the result is False.
 
-        An object is not tried again after `_MOST_TRIES` attempts. An object that fits into no
-        recess is not tried again after it was laid aside here.
+        `_MOST_TRIES` attempts are enough. If an object fits into no recess, laying it aside here
+        once is enough.
         """
         if region is None:
             return False

@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 _SUBSAMPLING = 3
 """Number of fine pixels per pixel of o_t, along each axis."""
 _CLOSING_RADIUS = 0.008
-"""A recess lacks those notches of its object that are narrower than twice this, in metres."""
+"""A recess does not follow notches of its object that are narrower than twice this, in metres."""
 _BAND = 0.006
 """The cost is computed at points within this distance, in metres, of the object's outline."""
 _FARTHEST = 0.012
@@ -93,8 +93,8 @@ class Registration:
     cost: float
     """The mean robust difference of the outlines, in metres."""
     offset: float = 0.0
-    """The signed distance of a point from the recess's outline minus that from the object's, in
-    metres; negative if the recess is larger."""
+    """How much smaller the recess is than the object on every side, in metres; negative if the
+    recess is larger."""
 
     def moved(self, pixel: Array) -> Array:
         """Returns the new position of a point (row, col) of the object."""
@@ -374,8 +374,7 @@ def _refine(
 
 
 def _jacobian(recess: Outline, turned: Array, positions: Array) -> Array:
-    """(p, 4): the derivatives of the distances from a recess's outline by rotation, row, col and
-    offset.
+    """(p, 4): the derivatives of the residuals with respect to rotation, row, col and offset.
 
     Args:
         recess: the outline of the recess.

@@ -162,8 +162,8 @@ def _layers(segmentation: Segmentation, region: Region) -> list[Region]:
 def _free_pose(
     segmentation: Segmentation, region: Region, layer: Region, pick: Array, resolution: float
 ) -> tuple[Array, float] | None:
-    """Finds the nearest pose on the table at which an object has the largest clearance in `_ROOMS`
-    that is possible.
+    """Finds the nearest pose on the table at which an object has enough clearance. The clearances
+    `_ROOMS` are tried in order.
 
     Returns:
         The place (row, col) of the gripped point and the object's rotation in radians; None if

@@ -56,7 +56,7 @@ Array = NDArray[np.float64]
 _HEIGHT = PixelGrid().z_max - PixelGrid().z_min
 """The default of `max_height`, in metres: points higher above the table are ignored."""
 _MOST_PIXELS = 10_000_000
-"""The number of pixels of a workspace above which its resolution is probably in a wrong unit."""
+"""If a workspace has more pixels than this, its resolution is probably in a wrong unit."""
 _DEPTH_FIELDS = ("depth_scale", "min_depth", "max_depth")
 _LENS_FILES = ("camera_info", "intrinsics")
 """The fields that name a file of intrinsics."""

@@ -1,4 +1,4 @@
-"""Converts depth to points in the base frame, and fits planes to most of them."""
+"""Converts depths to points in the base frame, and finds planes among these points."""
 
 from __future__ import annotations
 

@@ -40,11 +40,11 @@ _FARTHEST = 0.35
 _LEAST = 150
 """The least number of used pixels on a plane."""
 _BELOW = 0.5
-"""The plane at the calibrated height is the table if it has at least this share of the pixels of
-any plane below it."""
+"""To be the table, the plane at the calibrated height needs at least this fraction of the pixels of
+the largest plane below it."""
 _ABOVE = 0.08
-"""The plane at the calibrated height is the table if it has at least this share of the pixels of
-any plane above it. The share is small, because objects may hide most of a table."""
+"""The same for the largest plane above it. The fraction is small, because objects may hide most of
+a table."""
 _CURVED = 0.5
 """The depths are converted as if they were distances from the camera. If this reduces the table's
 noise to less than this fraction, they probably are distances."""

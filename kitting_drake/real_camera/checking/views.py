@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 _LEAST_SEEN = 0.01
 """The least share of the workspace that a camera with a correct pose sees."""
 _LEAST_DEPTH = 0.01
-"""The least share of pixels that have a depth, among those that look at the workspace."""
+"""Of the pixels that look at the workspace, at least this share must have a depth."""
 _NEAREST, _FARTHEST = 0.8, 1.25
 """The smallest and largest plausible median depth, as multiples of the table's depth. Beyond them
 the unit or the pose is wrong."""

@@ -165,7 +165,8 @@ def _bases(given: ArmBase, grid: PixelGrid) -> list[ArmBase]:
 
 
 def reach_table(measured: dict[str, Any]) -> Table:
-    """Makes a table of the reach of the given base, also by height, and of the best base."""
+    """Makes a table of the reach of the given base and of the best base. For the given base it also
+    has the reach at each height."""
     table = Table(title=f"reach of a {measured['model']}", title_justify="left")
     for heading in ("base x, y, z, m", "yaw, deg", "workspace"):
         table.add_column(heading, justify="right")

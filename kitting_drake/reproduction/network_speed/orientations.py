@@ -102,7 +102,7 @@ def _outlined(config: NetworkConfig) -> Networks:
 
 
 def _without_others(networks: Networks, names: set[str]) -> Networks:
-    """Removes all children but the named ones from networks, to free their memory."""
+    """Deletes all children of networks except those in `names`, to free their memory."""
     for name in [name for name, _ in networks.named_children() if name not in names]:
         delattr(networks, name)
     return networks

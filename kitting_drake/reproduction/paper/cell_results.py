@@ -43,7 +43,7 @@ class Divided(NamedTuple):
     others: list[Run]
     """The other runs, in their given order."""
     set_aside: list[Run]
-    """The runs from trees with uncommitted changes, whether of cells or not. No table may use
+    """All runs from trees with uncommitted changes, including those of cells. No table may use
     them."""
 
     @property

@@ -157,7 +157,7 @@ class Training:
     angle_only: bool = False
     """Whether only the pick-angle network is trained. The other networks are those of `base`."""
     times: int = 1
-    """The factor for the usual number of steps."""
+    """The training has this many times the usual number of steps."""
     preset: str = PRESET
     """The preset, which gives the size of the networks."""
     rotations: int | None = None

@@ -30,11 +30,11 @@ STEADIER = {
     ("stack_block_pyramid", "equivariant_transporter", 100): 1e-3,
 }
 """Learning rates by task, method and number of demonstrations, for trainings that fail at the best
-rate of their `reference`. Their pick-angle loss diverges, or it stays at that of a uniform
+rate of their `reference`. Their pick-angle loss diverges, or stays at the loss of a uniform
 distribution. They use the second-best rate of their `reference` instead."""
 MATCHED = "matched"
-"""The preset in which a baseline's networks are smaller than their originals by the same factor as
-the SO(2) networks are; see `paper.parameter_table`."""
+"""The preset that reduces the baselines' networks by the same factor as the SO(2) networks; see
+`paper.parameter_table`."""
 ROTATIONS = 18
 """The number of rotations (out of 36) in a training step of the Transporter in the cells of
 `_every_chance`."""
@@ -167,11 +167,11 @@ def _ablation() -> list[Cell]:
 
 
 def _every_chance() -> list[Cell]:
-    """Returns cells in which the baselines get larger networks and longer training.
+    """Returns cells with larger networks for the baselines and longer training for the Transporter.
 
-    They are on the tasks on which the baselines score lower than in the paper. Their networks
-    have the preset `MATCHED`; in the other cells they are smaller. The Transporter also learns from
-    more rotations per step, in more steps.
+    The tasks are those on which the baselines score lower than in the paper. The networks have the
+    preset `MATCHED`; the baselines' networks in other cells are smaller. The Transporter learns
+    from more rotations per step, in more steps.
     """
     trainings = [
         *(

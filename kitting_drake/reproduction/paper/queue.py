@@ -176,8 +176,8 @@ class Queue:
     def _best_rate(self, chosen_by: Training) -> float:
         """Returns the learning rate with the best validation result.
 
-        The training `chosen_by` comes from `reference`; it is done once with each learning rate.
-        Each result is saved at once and not computed again.
+        The training `chosen_by`, which comes from `reference`, runs once with each learning rate.
+        Each result is saved at once, so that no run is repeated.
         """
         for rate in self._untried(chosen_by):
             try:

@@ -116,7 +116,7 @@ def _tool(random: np.random.Generator) -> _Blocks:
 
 
 def _filled(centre: NDArray[np.float64], angle: float, blocks: _Blocks) -> NDArray[np.bool_]:
-    """The mask of samples (SIDE * _FINE, SIDE * _FINE) inside blocks, rotated about `centre`."""
+    """(SIDE * _FINE, SIDE * _FINE): the samples inside blocks that are rotated about `centre`."""
     points = (np.arange(SIDE * _FINE) + 0.5) / _FINE - 0.5
     grid = np.stack(np.meshgrid(points, points, indexing="ij"), axis=-1)
     row, col = np.rint((grid - centre) @ rotation_matrix(angle) / _BLOCK).astype(int).clip(-6, 6).T

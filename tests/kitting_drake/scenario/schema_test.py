@@ -24,7 +24,8 @@ ONE_OF_EVERYTHING = [
 
 SETTLED = {"start", "tray", "faces"}
 APART = {Learned: {"avoid_failed_picks"}, Kitting: SETTLED, ToolsetKitting: SETTLED}
-"""For each class, the fields that exclude others; `policies_test` and `starts_test` cover them."""
+"""By class, the fields that exclude some of the others; `policies_test` and `starts_test` cover
+them."""
 
 
 def reachable(kind: Any) -> set[type]:

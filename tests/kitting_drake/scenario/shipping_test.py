@@ -46,7 +46,7 @@ print(chosen.name, chosen.path)
 
 
 def on_a_node(shipment: Shipment, node: Path) -> str:
-    """Copies a shipment as Ray does; returns what a process prints that uses the copy."""
+    """Copies a shipment as Ray does; returns the output of a process that uses the copy."""
     env = shipment.runtime_env
     ignored = shutil.ignore_patterns(*env["excludes"])
     shutil.copytree(env["working_dir"], node, ignore=ignored)

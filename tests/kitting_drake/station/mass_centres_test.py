@@ -26,7 +26,7 @@ def test_a_tool_that_turns_with_the_hand_does_not_slide_through_the_pads():
     rate = np.array([0.0, 0.0, 2.5])
     place, drifted = -P_COM, -P_COM
     for step in range(128):
-        # Drake's time step of a tool that turns about its centre of mass, at the world's origin.
+        # Step as Drake does. The tool turns about its centre of mass, at the world's origin.
         now, after = (RotationMatrix.MakeZRotation(2.5 * STEP * (step + i)) for i in (0, 1))
         place = place + STEP * np.cross(rate, now @ -P_COM)
         drifted = drifted + STEP * np.cross(rate, now @ -P_COM)

@@ -412,7 +412,7 @@ def test_invalid_scenarios_raise(text: str, sentence: str):
         build(scenario)
 
 
-# Own scenes that are invalid.
+# Invalid scenes of a user's own task.
 
 
 @dataclasses.dataclass

@@ -65,7 +65,7 @@ def assembly_png(split: Split, openings: Sequence[Opening]) -> bytes:
 def _shifts(
     pieces: Sequence[Piece], middle: NDArray[np.float64], apart: float
 ) -> NDArray[np.float64]:
-    """Returns the shifts (n, 2), in mm, that move the drawn pieces apart from each other."""
+    """Returns the shifts (n, 2), in mm, that separate the pieces in the picture."""
     centres = np.array([np.array(p.region.bounds()).reshape(2, 2).mean(axis=0) for p in pieces])
     sizes = np.array([p.region.bounds() for p in pieces])
     step = (sizes[:, 2:] - sizes[:, :2]).mean(axis=0)

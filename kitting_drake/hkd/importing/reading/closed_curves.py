@@ -28,12 +28,12 @@ FRAMES = ("page", "tool")
 _JOIN_MM = 0.1
 """The largest gap between the ends of two curves that are joined, in mm."""
 _POINT_MM = 0.002
-"""A curve of at most this size, in mm, counts as a point and is dropped."""
+"""Curves up to this size, in mm, are dropped as points."""
 _SAME_MM = 0.05
-"""Two curves that are at most this far apart, in mm, count as one curve that is drawn twice."""
+"""Two curves at most this far apart, in mm, count as one curve that is drawn twice."""
 _LEAST_AREA_MM2 = 1.0
 _LINE_MM = 1.5
-"""Two outlines count as the sides of one thick line if it is narrower than this, in mm."""
+"""Two outlines closer than this, in mm, count as the two sides of one thick line."""
 _BOX = 0.9
 """A curve counts as a rectangle if it fills at least this share of its bounding box."""
 _THE_PAGE = "the page"

@@ -35,8 +35,8 @@ _OBJECT_HEIGHT = 0.003
 _PROTRUSION = 0.002
 """The largest height, in metres, by which a seated object rises above the fixture."""
 _FIXTURE_MARGIN = 0.006
-"""The least distance, in metres, of an object from the fixture's outline. For a recess, which lies
-inside the outline, half this distance is enough."""
+"""Pixels closer to the fixture's outline than this, in metres, cannot be a loose object. Pixels
+closer than half of this cannot be a recess."""
 _CLEARLY = 2.0
 """A height is not noise if it differs from a plane by more standard deviations than this.
 
@@ -48,10 +48,9 @@ _OBJECT_SEEN = 0.5
 _RECESS_SEEN = 0.3
 """The least share of a free recess's pixels that must be seen."""
 _GAP = 1.5
-"""Half the largest width, in pixels, of the gap between an object and its recess."""
+"""The gap between an object and its recess is at most twice this wide, in pixels."""
 _LEAST_GAP = 0.003
-"""Half the largest width, in metres, of the gap between an object and its recess. The larger of
-`_GAP` and `_LEAST_GAP` applies."""
+"""The same limit in metres. The larger of `_GAP` and `_LEAST_GAP` applies."""
 _FLAT = 0.0006
 """The largest deviation, in metres, from a flat floor's median depth. Twice the noise is used
 instead if that is more."""

@@ -1,4 +1,4 @@
-"""Makes the checks of slicers and cutters on the files of kits."""
+"""Checks the files of kits as slicers and cutters do."""
 
 import xml.etree.ElementTree as ElementTree
 import zipfile

@@ -113,7 +113,7 @@ def test_a_full_kit_is_no_missing_kit():
 
 
 def test_a_recess_that_was_filled_is_not_left_over():
-    # No object is visible: a seated one could be as flat as its recess's floor.
+    # No object is visible. A recess may still be filled by a tool as flat as the recess's floor.
     empty = scene()
     assert len(Inventory.of(empty).left_over.cavities) == 2
     placed = dataclasses.replace(empty, history=(placed_at((42.0, 60.0), aside=False),))
