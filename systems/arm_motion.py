@@ -28,10 +28,10 @@ from systems.vector_view import Array, Number
 _KEPT = 8
 """Number of planned motions that are cached."""
 _FARTHEST_STOP = 0.02
-"""The arm stops at a given pose or height only within this distance of the hand, in m. Otherwise it
-brakes where it is."""
+"""The arm stops at a given pose or height only if the hand is at most this far from it, in m.
+Otherwise the arm brakes where it is."""
 _SAME_HEIGHT = 0.003
-"""A hand that is less than this below a height, in m, counts as having reached it."""
+"""The hand counts as having reached a height if it is at most this far below, in m."""
 
 _HELD_REACH = 0.125
 """How far a held object reaches from the fingertips at most, in m. `read_surface_heights` assumes

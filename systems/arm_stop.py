@@ -15,8 +15,8 @@ from systems.arm_limits import JOINTS, ArmLimits
 _SHARE = 0.98
 """Fraction of the limits of acceleration and jerk that a stop uses."""
 _TRIES = 4
-"""How many jerk limits are tried at most, until the rates of the torques are within their
-limits."""
+"""The jerk is reduced until no torque's rate exceeds its limit. This is the largest number of
+attempts."""
 _RESTS = 1e-9
 """Below this velocity in rad/s and this acceleration in rad/s^2 the arm counts as at rest."""
 

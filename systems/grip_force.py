@@ -13,8 +13,8 @@ the force has risen."""
 _EASY_MOMENT = 0.18
 """A moment about the axis of the pads that friction holds easily, in N m."""
 _MOMENT_ARM = 0.0030
-"""While the hand accelerates, the pads hold a moment up to their force times this length, in m. A
-long round handle begins to turn if the moment exceeds the force times 5 mm."""
+"""While the hand accelerates, the pads withstand moments up to their force times this length, in m.
+A long round handle begins to turn if the moment exceeds the force times 5 mm."""
 _HELD_MOMENT = 0.30
 """An object that does not turn between the pads at rest may turn in motion if its moment is larger
 than this, in N m."""
@@ -29,8 +29,8 @@ _SOFT, _SOFT_SHARE = 0.006, 0.2
 """If the jaws sink farther into an object than `_SOFT`, in m, or than `_SOFT_SHARE` of its width,
 they press less."""
 _MUCH_LESS = 0.85
-"""If the jaws sink into an object, the force is lowered only if the new force is at most this
-fraction of the present one."""
+"""If the jaws sink into an object, their force is lowered in steps. Each step lowers it to at most
+this fraction of the present force."""
 _GENTLE, _GENTLEST = 0.5, 0.25
 """Fractions of the acceleration limits. An object that may turn is moved with at most `_GENTLE` of
 them; no object is moved with less than `_GENTLEST` of them."""

@@ -233,8 +233,8 @@ class OraclePolicy(LeafSystem):
         kept: frozenset[int],
         tried: NDArray[np.float64] | None = None,
     ) -> list[int]:
-        """Indices of the goals that may be filled now. Goals without a misplaced object come first,
-        in the order of how often their objects were tried, least often first.
+        """Indices of the goals that may be filled now. Goals with a misplaced object come last.
+        Otherwise, goals whose object was tried less often come first.
 
         Args:
             poses: X_WB of each of the n objects.

@@ -119,8 +119,10 @@ class RestDetector(LeafSystem):
         Args:
             objects: n bodies that may come to rest.
             movers: bodies that never rest: the links of the hand.
-            position_tolerance: how far the origin of an object that stays in place may move, in m.
-            angle_tolerance: how far an object that stays in place may rotate, in rad.
+            position_tolerance: an object whose origin moves farther than this, in m, has not stayed
+                in place.
+            angle_tolerance: an object that rotates farther than this, in rad, has not stayed in
+                place.
             time_to_sleep: how long an object must stay in place, in s.
             wake_distance: distance at which something wakes an object, in m. A body that moves
                 farther than this within one period may hit an object at rest, which stays fixed

@@ -12,7 +12,7 @@ from kitting_drake.station import KittingStation
 from systems.placement import GONE
 
 _NOTHING_TO_DO = ("done", "nothing fits")
-"""The policies' reasons for stopping that mean: no more objects can be placed."""
+"""The reasons that policies give if they stop because no more objects can be placed."""
 _UNJUDGED = ("", "interrupted")
 
 

@@ -37,8 +37,8 @@ from kitting_drake.hkd.kits.parameters import KitParameters
 from kitting_drake.hkd.tools.tool import Tool
 
 _FORMAT_VERSION = "1"
-"""The version of the pictures in the cache. Increase it when a change of the code gives the same
-subject another picture."""
+"""The version of the pictures in the cache. Increase it when the same subject gives a different
+picture."""
 _PICTURE = "picture.png"
 _BACKGROUND = (0.97, 0.97, 0.96)
 # A key light casts the shadows. The fill light is at the camera, where its shadows are hidden.

@@ -161,8 +161,8 @@ def _of_variant(given: object, current: object) -> object:
 
 
 def _of_variants(given: object, current: Mapping[str, object]) -> object:
-    """Applies `_of_variant` to each value of `given` and the value of that name in `current`, if
-    any."""
+    """Applies `_of_variant` to each value of `given` that has a counterpart of the same name in
+    `current`."""
     if not isinstance(given, dict):
         return given
     return {

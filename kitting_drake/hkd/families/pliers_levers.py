@@ -73,7 +73,7 @@ def build_levers(v: Levers, j: Jaws) -> list[Part]:
     upper, lower = _lever(v, j, True), _lever(v, j, False)
     steel = Part("steel", v.steel_material, upper + lower, _steel_hulls(v, j))
     rivet = _rivet(v)
-    # Sleeves that are higher than the rivet's head keep other bodies off it, so it needs no hull.
+    # The rivet needs no hull if sleeves that are higher than its head keep other bodies off it.
     hidden = v.grip_length_mm and v.grip_thickness_mm > v.thickness_mm + 2.6
     parts = [Part("rivet", v.rivet_material, rivet.solid, [] if hidden else rivet.hulls), steel]
     if v.grip_length_mm:

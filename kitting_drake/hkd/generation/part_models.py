@@ -27,8 +27,7 @@ _MODULUS = 2e7
 """The hydroelastic modulus in Pa. The pads press with 30 N on a few square millimetres of a small
 part, and would sink into a softer part by millimetres."""
 _FORMAT_VERSION = "3"
-"""The version of the files in the cache. Increase it when the code makes a different model for the
-same name."""
+"""The version of the files in the cache. Increase it when the same name gives a different model."""
 _CREASE_ANGLE_DEG = 35.0
 _NAME = re.compile(r"([a-z]+)(?:_(\d+(?:\.\d+)?(?:x\d+(?:\.\d+)?)*))?")
 

@@ -41,7 +41,7 @@ _UNUSUAL = 0.12
 _HIGHEST = 0.046
 """The largest height that fits into a kit's block, in metres."""
 _COMPOSED, _PARTS = 0.2, 0.3
-"""The shares of the random tools that are composed of simple solids, and that are simple parts."""
+"""The share of random tools that are composed of simple solids, and the share of simple parts."""
 _JITTER = 0.22
 """The logarithm of the largest factor by which a length or an angle of a design changes."""
 _REFINED = 6.0

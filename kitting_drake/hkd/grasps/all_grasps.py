@@ -18,8 +18,7 @@ from systems.grasp import Grasp
 from systems.grip_force import GRAVITY
 
 _FORMAT_VERSION = "1"
-"""The version of the files in the cache. Increase it when a change of the code gives the same tool
-other grasps."""
+"""The version of the files in the cache. Increase it when the same tool gives different grasps."""
 _FILE = "grasps.json"
 _EASY_MOMENT = 0.18
 """The moment about the axis through both pads that the grip easily withstands, in N m."""

@@ -28,8 +28,8 @@ from kitting_drake.hkd.tools.tool import Tool
 _DIGITS = 7
 """The number of decimals of coordinates in files."""
 _FORMAT_VERSION = "9"
-"""The version of the files in the cache. Increase it when a change of the code makes another kit of
-the same tools, parameters and poses."""
+"""The version of the files in the cache. Increase it when the same tools, parameters and poses give
+a different kit."""
 
 
 @dataclass(frozen=True)

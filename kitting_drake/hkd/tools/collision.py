@@ -19,8 +19,8 @@ from kitting_drake.hkd.tools.solids import SEGMENTS
 GRID_MM = 0.05
 
 _XY, _XZ, _YZ = [0, 1], [0, 2], [1, 2]
-# A first pass merges hulls whose projections change by less than this. Fewer hulls are then left
-# to grow, which is slow.
+# A first pass merges hulls whose projections change by less than this. It saves time, because
+# growing each hull is slow.
 _EXACT_MM = 0.03
 # A region counts as inside another one if at most this area (mm^2) of it lies outside.
 _AREA = 1e-4
@@ -152,8 +152,8 @@ def _fits(hull: _Hull, allowed: CrossSection, tolerance: float) -> bool:
 
 
 def _merged(hulls: list[_Hull], allowed: CrossSection, tolerance: float) -> list[_Hull]:
-    """Merges pairs of hulls, as long as `_fits` allows one; first the pair that adds the least
-    volume."""
+    """Merges pairs of hulls until `_fits` allows no further pair. The pair that adds the least
+    volume is always merged first."""
     alive = dict(enumerate(hulls))
 
     def options(a: int, b: int) -> list[tuple[float, int, int]]:
@@ -178,11 +178,11 @@ def cover(
 ) -> list[np.ndarray]:
     """Covers `hulls` with few convex hulls, which may overlap. The result is deterministic.
 
-    First, hulls are merged where this hardly leaves `outline`. Then each hull is a seed, which is
-    repeatedly merged with the neighbour that adds the least volume. Its xy projection must stay
-    within `allowed`; its other projections may grow by at most `tolerance` (mm). Grown hulls are
-    selected, each the one that covers the most uncovered volume, until all of `hulls` are covered.
-    Finally, hulls that hardly change any projection are dropped.
+    First, hulls are merged if the merged hull hardly sticks out of `outline`. Then each hull is a
+    seed, which is repeatedly merged with the neighbour that adds the least volume. Its xy
+    projection must stay within `allowed`; its other projections may grow by at most `tolerance`
+    (mm). The grown hull that covers the most uncovered volume is selected. This repeats until all
+    of `hulls` are covered. Finally, hulls that hardly change any projection are dropped.
     """
     merged = _merged([_Hull(h) for h in hulls], _grown(outline, _EXACT_MM), _EXACT_MM)
     grown = [_grow(seed, merged, allowed, tolerance) for seed in range(len(merged))]

@@ -16,9 +16,9 @@ from kitting_drake.hkd.tools.collision import furthest, projection, thinned
 Array = NDArray[np.float64]
 
 INSIDE_MM = 0.04
-"""The largest distance of the hulls' outline inside the true outline, in mm."""
+"""How far the hulls' outline may lie inside the true outline, in mm."""
 NOTCH_MM = 3.0
-"""Hulls may bridge notches up to twice this wide, in mm. Cavities bridge them, too."""
+"""Half the width of the widest notches that hulls may bridge, in mm. Cavities bridge them too."""
 _HEIGHT_MM = 0.2
 """The tolerance in mm for thinning a hull's vertices; that for the outline is finer."""
 _AREA = 2e-3
@@ -40,9 +40,9 @@ def fine_hulls(
 
     Args:
         parts: the closed surfaces of the solid's parts, as triangles (n, 3, 3) in mm.
-        notch: hulls may bridge notches and holes up to twice this wide, in mm.
-        inside: how far the hulls' outline may lie inside the true one, in mm. Outside, it may lie
-            half as far.
+        notch: half the width, in mm, of the widest notches and holes that hulls may bridge.
+        inside: how far, in mm, the hulls' outline may lie inside the true outline. It may lie
+            outside by at most half as much.
 
     Raises:
         ValueError: a surface is not closed.
@@ -77,7 +77,8 @@ def plan_deviation(
     Args:
         hulls: points (n, 3) in mm.
         outline: the true outline from above, in mm.
-        notch: bridges over notches and holes up to twice this wide, in mm, do not count as outside.
+        notch: half the width, in mm, of the widest notches and holes that hulls may bridge. The
+            bridges do not count as outside.
 
     Returns:
         The largest distances outside and inside, in mm, with a precision of 0.001 mm.
@@ -112,9 +113,9 @@ def without_notches(outline: CrossSection, notch: float) -> CrossSection:
 def convex_cells(inner: CrossSection, outer: CrossSection) -> list[CrossSection]:
     """Covers the region `inner` with few convex polygons that stay within `outer` and may overlap.
 
-    The region is triangulated. A group grows from the largest uncovered triangle by neighbouring
-    triangles, as long as the hull of the group is within `outer`. The new cell is the hull of the
-    group's uncovered triangles. This repeats until all triangles are covered.
+    The region is triangulated. Starting from the largest uncovered triangle, neighbouring triangles
+    are added as long as the hull of all of them is within `outer`. The new cell is the hull of
+    those triangles that no earlier cell covers. This repeats until all triangles are covered.
     """
     loops = inner.to_polygons()
     corners = np.vstack(loops)
@@ -168,7 +169,7 @@ def _grow(
 
 
 def _needed(cells: list[CrossSection], inner: CrossSection) -> list[CrossSection]:
-    """Drops cells that are not needed to cover `inner`. Tries the smallest first."""
+    """Drops cells that are not needed to cover `inner`, the smallest first."""
     kept = list(cells)
     for cell in sorted(cells, key=lambda c: c.area()):
         rest = [other for other in kept if other is not cell]

@@ -118,7 +118,7 @@ def measure_rotation(
 
     shift, _ = _minimum(uncommon_area, np.zeros(2), 2.0)
     outline_deviation = deviation(shift)
-    # At twice the limit, another translation is assumed not to bring the deviation below the limit.
+    # If the deviation is twice the limit, assume that no translation brings it below the limit.
     if complete or outline_deviation < 2 * MOST_OUTLINE_DEVIATION_MM:
         outline_deviation = _minimum(deviation, shift, 0.5)[1]
     if not complete and outline_deviation >= MOST_OUTLINE_DEVIATION_MM:

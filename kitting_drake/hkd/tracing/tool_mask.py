@@ -17,12 +17,12 @@ _NO_SHADOW = 1.3
 _BALL_MM = 0.9
 """The radius of the disc that `_reached` rolls over the ground, in mm."""
 _ROUGH = 0.022
-"""For `MIDDLE`, any surface counts as even if its roughness, in logarithms of light, is at most
-this."""
+"""Any surface with less roughness than this, in logarithms of light, is even for `MIDDLE`."""
 _MOST_FINE = 0.1
 _HOLE_BALL_MM = 0.6
 _STRIP_MM = 1.2
-"""An eroded region in `_shaded_holes` counts as a strip if it is at most twice this wide, in mm."""
+"""In `_shaded_holes`, an eroded region counts as a strip if half its width, in mm, is at most
+this."""
 _EDGE_MM = 2.3
 """The distance by which the ground is extended over the rough pixels at an edge, in mm."""
 _SHINE_STEEP = 0.6
@@ -30,8 +30,8 @@ _SHINE_STEEP = 0.6
 _STEP_REACH_MM = 1.5
 """The radius around a pixel, in mm, of the area in which a step of light is measured."""
 _SHINY, _SHINY_SHARE = 0.06, 0.25
-"""How much brighter than the ground a reflection is, in logarithms of light; and the least share of
-a bay or hole of a tool's mask that must be so bright."""
+"""A bay or hole of a tool's mask is a reflection if more than `_SHINY_SHARE` of its pixels are
+brighter than the ground by more than `_SHINY`, in logarithms of light."""
 _SHINE_REACH_MM = 3.0
 _GLARE, _GLARE_SPREADS = 0.025, 5.0
 """The least brightness of glare above the ground: in logarithms of light, and in standard
@@ -286,7 +286,7 @@ def _roughness(cv2: Any, light: Array, even: Array, px_per_mm: float) -> Array:
 def _reached(cv2: Any, even: Array, plain: Array, px_per_mm: float) -> Array:
     """Finds the pixels that a rolling disc can cover.
 
-    The disc starts on plain ground, and all pixels below it must be even.
+    The disc starts on plain ground and rolls over `even` pixels only.
 
     Args:
         cv2: OpenCV.
@@ -304,7 +304,7 @@ def _reached(cv2: Any, even: Array, plain: Array, px_per_mm: float) -> Array:
 
 
 def _shaded_holes(cv2: Any, even: Array, like_ground: Array, px_per_mm: float) -> Array:
-    """Finds even regions that look like ground in shadow: holes, and strips beside a tool."""
+    """Finds smooth regions that look like ground in shadow: holes, and strips beside a tool."""
     disc = _disc(cv2, _HOLE_BALL_MM * px_per_mm)
     room = cv2.erode(even.astype(np.uint8), disc)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(room, connectivity=4)

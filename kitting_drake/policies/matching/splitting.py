@@ -39,12 +39,13 @@ _NOTCH = 0.3
 """In the search for poses, the score of each pixel of the recess that lies in a narrow notch of the
 region."""
 _RIM = 1.5
-"""In the search for poses, the score of a recess whose outline coincides with the region's."""
+"""In the search for poses, the weight of the agreement between the outlines. The mean score of the
+recess's pixels has the weight 1."""
 _INSIDE = 0.94
 """The least share of a recess's area that must lie within the region."""
 _NEAR = 0.0025
-"""A point of an object's outline counts as shared if it is less than this far from the region's
-outline, in metres."""
+"""A point of an object's outline counts as shared if its distance from the region's outline, in
+metres, is less than this."""
 _SHARED = 0.45
 """The least share of an object's outline that must be shared with the region's outline."""
 _COST = 0.0010
@@ -62,14 +63,13 @@ _HIGHER = 0.006
 """Pixels that are higher than an object's median height by more than this, in metres, belong to
 something that lies on the object."""
 _ACROSS = 6
-"""Something lies across an object's outline if at least this many of its pixels are inside the
-outline, and as many outside."""
+"""A higher part of a region lies across an object's outline if at least this many of the part's
+pixels are inside the outline, and at least this many are outside."""
 _SLIVER = 1
-"""After objects are cut out of a region, the remaining parts are eroded by this many pixels, to
-drop slivers."""
+"""After objects are cut out of a region, the remainder is eroded by this many pixels, to drop
+slivers."""
 _LEAST_REST = 0.0002
-"""After objects are cut out of a region, a remaining part counts as an object if its area is at
-least this, in square metres."""
+"""A part of this remainder is an object if its area is at least this, in square metres."""
 
 
 @dataclass(frozen=True)
@@ -154,8 +154,8 @@ def _split(
 
 
 def _rest(rest: Mask, relief: NDArray[np.float32], resolution: float) -> list[Region]:
-    """Returns the objects in `rest`, the remaining parts of a region after objects are cut out.
-    Slivers are dropped."""
+    """Returns the objects in `rest`, the remainder of a region after objects are cut out. Slivers
+    are dropped."""
     core = ndimage.binary_erosion(rest, iterations=_SLIVER)
     labels, count = ndimage.label(ndimage.binary_propagation(core, mask=rest))
     regions = (labels == number for number in range(1, count + 1))
@@ -195,8 +195,8 @@ def _judge(
     relief: NDArray[np.float32],
     resolution: float,
 ) -> _Found | None:
-    """Returns the object that a fitted outline of a recess shows; None if the outlines do not agree
-    well enough."""
+    """Returns the object inside a recess's outline that was fitted to a region. Returns None if the
+    two outlines do not agree well enough, or if something lies across the object's outline."""
     rows, cols = np.indices(region.shape)
     positions = np.stack([rows, cols], axis=-1).reshape(-1, 2)
     back = (positions - fit.shift) @ rotation_matrix(fit.rotation)

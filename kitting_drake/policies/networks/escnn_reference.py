@@ -148,8 +148,8 @@ def _field_type(fibre: Fibre, count: int) -> enn.FieldType:
 
 
 def _convolution(source: nn.Module) -> enn.R2Conv:
-    """Makes escnn's version of a convolution with the same weights, which are stored in escnn's
-    order."""
+    """Makes escnn's version of a convolution, with the same weights. Both store their weights in
+    the same order."""
     assert isinstance(source, SteerableConv2d)
     out_fields, in_fields, _ = source.weights.shape
     layer = enn.R2Conv(

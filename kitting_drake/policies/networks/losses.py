@@ -31,8 +31,8 @@ even odds for an image of the paper's size."""
 _WINDOW = 17
 """The side, in pixels, of the window around a label in which the full correlation is computed."""
 _FINE_REACH = math.radians(10)
-"""The largest difference, in radians, from a label's rotation at which the full correlation is
-computed."""
+"""The full correlation is computed at rotations that differ from a label's rotation by at most
+this, in radians."""
 
 
 def interpolate_label(

@@ -110,7 +110,7 @@ def _given_pose(node: dict[str, Any], where: str, folder: Path) -> FoundPose:
 
 
 def _as_stated(key: str, found: FoundPose, names: FrameNames) -> FoundPose:
-    """Returns the pose of the camera, according to the names of its field and its frames."""
+    """Returns the camera's pose: interprets `found` by the names of its field and its frames."""
     turned = directed(found, names)
     if key not in _STATED:
         return turned

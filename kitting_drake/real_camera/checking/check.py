@@ -162,7 +162,7 @@ def levelled(X_BC: Array, plane: Plane, grid: PixelGrid) -> Array:
     R = plane.levelling()
     corrected = X_BC.copy()
     corrected[:3, :3] = R @ X_BC[:3, :3]
-    # Find the height to which the rotation about the camera moves the plane below the camera.
+    # The rotation about the camera moves the plane. Find the new height of the plane.
     point = np.array([*X_BC[:2, 3], float(plane.height(X_BC[:2, 3]))])
     height = (R @ (point - X_BC[:3, 3]) + X_BC[:3, 3])[2]
     corrected[2, 3] += grid.z_min - height

@@ -34,7 +34,7 @@ _WARNED_OFF = 0.005
 _WARNED_TILT = math.radians(0.65)
 """The largest tilt of the table, in radians, without a warning."""
 _STEP = 4
-"""Of an image, only the rows and columns at multiples of this are used."""
+"""Only the rows and columns of an image at multiples of this are used."""
 _FARTHEST = 0.35
 """The distance from the table's height within which planes are searched, in metres."""
 _LEAST = 150

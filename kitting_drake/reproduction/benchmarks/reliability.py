@@ -53,8 +53,8 @@ _DECISIONS = 3
 """The largest number of decisions of a policy in a scene. Each avoids the tools of the earlier
 ones."""
 LEAST_CONFIDENCE = 0.9
-"""The confidence below which a robot does not act. The confidence is a probability of success, so
-its least value follows from the cost of a wrong action, and is not fitted."""
+"""The confidence below which a robot does not act. This threshold is not fitted: confidence is a
+probability of success, so the threshold follows from the cost of a wrong action."""
 _FOLDS, _FOLD = 6, 10
 """The number of parts in the cross-validation, and the number of successive scenes that stay in one
 part."""

@@ -56,9 +56,9 @@ def benchmark_trace(
 ) -> dict[str, Any]:
     """Renders three photos of each tool, traces them and measures the outlines, in mm.
 
-    There are separate errors for the outlines about which the tracer reports no doubts. There are
-    also errors without gaps below `GAP_MM`: in a photo, a tool's sides hide narrow gaps, and its
-    cavity bridges them.
+    The outlines about which the tracer reports no doubts are also summarized separately. Errors are
+    also measured after gaps narrower than `GAP_MM` are closed: in a photo, a tool's sides hide such
+    gaps, and its cavity bridges them.
 
     Args:
         names: the names of the tools.

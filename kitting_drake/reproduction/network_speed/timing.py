@@ -19,10 +19,10 @@ from torch.utils.flop_counter import flop_registry
 Name = TypeVar("Name")
 
 _WARM_UPS = 2
-"""The largest number of runs before the timed ones, in which kernels are chosen and memory is
-allocated."""
+"""The largest number of runs before the timing starts. In these runs kernels are chosen and memory
+is allocated."""
 _PEAK_RUNS = 15
-"""The number of runs for the peak rate, of which the fastest counts."""
+"""The number of runs that measure the peak rate. The fastest one counts."""
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,7 @@ def paired_difference(
 ) -> Estimate | None:
     """Computes how much better one run is than another, on the seeds that both ran.
 
-    The interval is a bootstrap over episodes. Each episode is drawn with the rates of both runs, so
+    The interval is a bootstrap over episodes. Each resampled episode has the rates of both runs, so
     scenes that are hard for both cancel. The interval does not include the variation between
     trainings of a method.
 
@@ -56,7 +56,7 @@ def mean_paired_difference(
 ) -> Estimate | None:
     """Computes how much better the first run of each pair is, on average over the pairs.
 
-    Episodes are resampled jointly over all runs, because they share their scenes.
+    Episodes are resampled jointly over all runs, because the runs share their scenes.
 
     Args:
         pairs: pairs of summaries, as in `paired_difference`.

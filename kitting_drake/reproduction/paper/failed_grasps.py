@@ -59,12 +59,12 @@ def changeable(summary: Mapping[str, Any]) -> Changeable:
     Newer summaries have this count. An older one has only the number F of failed grasps in E
     episodes. At most n = min(F, E) of these episodes have a failed grasp. This gives two bounds:
 
-    - At least F - n actions follow a failed grasp: in each episode, all failed grasps but the first
-      one follow it.
-    - At most, n episodes begin with a failed grasp, and all of their later actions follow it. The
-      other episodes need at least one action for each placed object. So the bound is the number of
-      all actions, minus n, minus the least number of objects placed in any E - n episodes. It is
-      also at most the number of actions that the task allows in n episodes, minus n.
+    - At least F - n actions follow a failed grasp: in each episode, every failed grasp except the
+      first follows an earlier one.
+    - The most actions follow a failed grasp if n episodes begin with one. The other episodes need
+      at least one action for each placed object. So the bound is the number of all actions, minus
+      n, minus the least number of objects placed in any E - n episodes. The bound is also at most
+      the number of actions that the task allows in n episodes, minus n.
 
     Args:
         summary: the summary that `evaluate` wrote for a learned policy. If it has no number of

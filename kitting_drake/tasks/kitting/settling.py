@@ -70,7 +70,7 @@ class StillBlock:
     size: tuple[float, float, float]
     """Side lengths of the box, in metres."""
     X_WB: RigidTransform
-    """Pose in the world of the middle of the box's bottom."""
+    """World pose of the middle of the box's bottom."""
 
 
 SettlingModel = Path | ConvexBody

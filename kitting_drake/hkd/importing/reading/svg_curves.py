@@ -78,7 +78,7 @@ def svg_curves(path: Path, unit_mm: float | None = None) -> DrawnCurves:
 
 
 def _filling(shape: Any, number: int) -> tuple[bool, int | None]:
-    """Returns whether a shape is filled, and `number` if it is filled, else None."""
+    """Returns (True, `number`) if a shape is filled, and (False, None) if it is not."""
     filled = _is_painted(shape.fill)
     return filled, number if filled else None
 

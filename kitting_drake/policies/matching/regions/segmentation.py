@@ -35,8 +35,8 @@ _OBJECT_HEIGHT = 0.003
 _PROTRUSION = 0.002
 """The largest height, in metres, by which a seated object rises above the fixture."""
 _FIXTURE_MARGIN = 0.006
-"""Pixels closer to the fixture's outline than this, in metres, cannot be a loose object. Pixels
-closer than half of this cannot be a recess."""
+"""Outside a fixture, objects are found only beyond this distance from its outline, in metres.
+Inside, recesses are found only beyond half this distance."""
 _CLEARLY = 2.0
 """A height is not noise if it differs from a plane by more standard deviations than this.
 
@@ -50,7 +50,7 @@ _RECESS_SEEN = 0.3
 _GAP = 1.5
 """The gap between an object and its recess is at most twice this wide, in pixels."""
 _LEAST_GAP = 0.003
-"""The same limit in metres. The larger of `_GAP` and `_LEAST_GAP` applies."""
+"""The same limit in metres. The larger of the two limits applies."""
 _FLAT = 0.0006
 """The largest deviation, in metres, from a flat floor's median depth. Twice the noise is used
 instead if that is more."""

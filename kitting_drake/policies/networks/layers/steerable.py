@@ -329,8 +329,8 @@ class InvariantPart(nn.Module):
 def _of_several_fields(matrix: NDArray[np.float64], fields: int) -> Tensor:
     """Returns the block-diagonal matrix that applies a matrix to each of several fields.
 
-    It combines about 64 channels. Although most of its entries are zero, one such product takes
-    half as long as several products with eight channels each.
+    The matrix combines about 64 channels. Although most of its entries are zero, one product with
+    it takes half as long as several products with eight channels each.
     """
     together = math.gcd(fields, max(_TOGETHER // len(matrix), 1))
     blocks = np.kron(np.eye(together), matrix)
