@@ -97,7 +97,7 @@ def test_only_the_equivariant_transporter_grows_in_parameters(measured: dict[str
     assert growth["so2"]["from"] == 26
     assert growth["so2"]["to"] == 30
     assert growth["so2"]["parameters"] == 1
-    # In our angle network, only the discretization depends on N, which costs little.
+    # In our angle network, only the discretization depends on N, and it costs little.
     assert growth["so2"]["operations"] == pytest.approx(1, abs=1e-3)
     assert growth["equivariant_transporter"]["parameters"] == pytest.approx(30 / 26, rel=0.05)
     assert growth["equivariant_transporter"]["operations"] == pytest.approx((30 / 26) ** 2, rel=0.1)

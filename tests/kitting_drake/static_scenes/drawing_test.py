@@ -179,7 +179,7 @@ def test_samples_have_a_grasp_of_each_loose_tool():
     scene = StaticScene.of(Observation(), actions)
     final = StaticScene.of(Observation(), np.zeros((0, 8)))
     samples = StaticSamples(StaticScenes(GRID, (final, scene)))
-    # Samples are a proper sequence: negative indices count from the end, later ones raise.
+    # Samples are a proper sequence: negative indices count from the end, too large ones fail.
     assert (samples[-1].pick == samples[len(samples) - 1].pick).all()
     with pytest.raises(IndexError):
         samples[len(samples)]

@@ -12,7 +12,7 @@ from systems.signals import PixelGrid
 
 SPREAD = 0.3
 OTHER_STREAMS = [stream for stream in range(20) if stream != 13]
-"""The second numbers of other random streams: masses use [seed, 13].
+"""Masses use the random stream [seed, 13]. These are the second numbers of the other streams.
 
 Scenes use [seed] and [seed, 1] to [seed, 3]; colours, lights and cameras use others. NumPy pads
 seeds with zeros, so [seed, 0] equals [seed]."""

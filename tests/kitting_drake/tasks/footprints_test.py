@@ -16,7 +16,7 @@ def test_separation_is_the_gap_between_polygons():
     # The diamond's corner points at a side of the square.
     diamond = rectangle(0.02, 0.02, x=0.03, theta=math.pi / 4)
     assert separation(square, diamond) == pytest.approx(0.02 - 0.01 * math.sqrt(2))
-    # Between corners the separation is less than the distance, which is 14 mm here.
+    # Two corners that face each other are 14 mm apart, but their separation is only 10 mm.
     assert separation(square, rectangle(0.02, 0.02, x=0.03, y=0.03)) == pytest.approx(0.01)
 
 

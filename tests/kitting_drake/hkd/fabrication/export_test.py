@@ -206,7 +206,7 @@ def test_the_solid_is_cut_exactly_as_drawn(full: Path):
     block, height = solid(full), record(full)["block"][2]
     drawn = polylines(full, "CAVITIES", "NOTCHES")
     assert {depth for depth, _ in polylines(full, "LABELS")} == {0.6}
-    # Slices from below the letters and bevels down to the deepest floor.
+    # Compare slices below the letters and bevels, down to the deepest floor.
     for z in np.arange(1.5, max(depth for depth, _ in drawn), 4.3):
         open_there = CrossSection()
         for depth, points in drawn:

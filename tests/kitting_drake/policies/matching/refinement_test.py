@@ -13,7 +13,7 @@ GRID, PLANNER = PixelGrid(), PickPlaceParameters()
 
 
 def bar(blocked: float) -> Segmentation:
-    """A bar of 240 mm along x; from its low end, blocks beside it leave no room for the jaws.
+    """A bar of 240 mm along x. Blocks beside its lower part leave no room for the jaws.
 
     `blocked` is the fraction of the bar's length that has blocks beside it.
     """

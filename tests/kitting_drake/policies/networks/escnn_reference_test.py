@@ -46,7 +46,7 @@ def test_is_the_same_network(name: str, sides: tuple[int, int], both: tuple[Netw
     assert expected.std() > 0.01
     assert_close(found, expected)
 
-    # Both have the same gradient of every weight.
+    # Both networks have the same gradient for every weight.
     (expected**2).sum().backward()
     (found**2).sum().backward()
     pairs = list(zip(layers(ours, SteerableConv2d), layers(escnn, enn.R2Conv), strict=True))

@@ -119,7 +119,7 @@ def test_wrong_stop_decisions_are_counted_and_cost_as_if_lost():
     ("present", "absent", "threshold"),
     [
         # If the two ranges of log-odds do not overlap, the threshold lies between them, nearer to
-        # that of final observations.
+        # the range of final observations.
         ((3.0, 9.0, 5.0), (-1.0, -7.0), 0.0),
         # Otherwise it is the threshold with the fewest errors; the lowest one if there are several.
         ((3.0, 5.0, 6.0, -2.0), (-1.0, -3.0, 0.0), 0.75),

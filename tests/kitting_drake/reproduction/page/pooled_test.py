@@ -17,7 +17,7 @@ GENERALIST = shipped_policies()["generalist"].digest(SCENARIOS)
 def run(
     ends: list[int], seeds: range, recover: str = "false", limit: float = 180.0, **fields: Any
 ) -> Run:
-    """A run of the generalist whose episodes all end with the outcomes `ends` of their objects."""
+    """A run of the generalist. In every episode, `ends` are the outcomes of the objects."""
     policy = f"!Learned {{weights: '', recover: {recover}}}"
     scenario = load_scenario(UNSEEN, text=f"{{policy: {policy}, time_limit: {limit}}}")
     objects = {str(index): end for index, end in enumerate(ends)}

@@ -271,7 +271,7 @@ def test_a_matched_baseline_is_another_training(queue: Pretending):
         other = dataclasses.replace(chance, policy=dataclasses.replace(chance.policy, **change))
         assert other.policy.name != chance.policy.name
         assert other.departure(summary) == said
-    # The Equivariant Transporter starts from a base, which is trained first: a policy of figure 6.
+    # The Equivariant Transporter starts from a policy of figure 6, which is trained first.
     theirs = cells["unseen_equivariant_transporter_36_100_every_chance"].policy
     assert theirs.base == cells["unseen_equivariant_transporter_180_100"].policy
     queue.calls.clear()
