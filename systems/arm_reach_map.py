@@ -18,9 +18,10 @@ _SWIVELS = np.arange(-31, 32) / 10
 """The swivels that are tried, in rad: angles of the wrist to the vertical plane through base and
 hand, as in `systems.arm_postures`."""
 _STEP = 0.005
-"""Spacing of the hand's distances from the base's axis for which postures are computed, in m."""
+"""Postures are computed for distances of the hand from the base's axis that are multiples of this,
+in m."""
 _FARTHEST = 1.0
-"""Largest distance of the hand from the base's axis for which postures are computed, in m."""
+"""The largest of these distances, in m."""
 _CHUNK = 256
 
 

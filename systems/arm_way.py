@@ -259,7 +259,7 @@ class ArmWay:
 
     def _missing(self, path: _Path, clear: float, reach: float) -> float:
         """How far, in m, the hand or the held object sinks below the clear height between start and
-        end; zero or less if neither does."""
+        end; zero or less if both stay above it."""
         tips, low = path.tips, path.tips[:, 2]
         if path.points[:, [2, 4]].any():
             low = low - _reach_below(path.points, reach)

@@ -1,4 +1,4 @@
-"""Finds, from true poses, which objects lie on others and how obstructed each grasp is."""
+"""Finds, from true poses, which objects lie on others and which grasps are unobstructed."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ _LEAST_SQUARES = 2
 _FLAT = math.radians(2.5)
 """An object tilted by less than this, in radians, lies flat."""
 _SAME_SHAPE = 0.0003
-"""Two surfaces count as equal if the mean distance between their points is less than this, in
-metres, plus 1.1 times the points' spacing."""
+"""Two surfaces count as equal if the mean distance between their points is less than 1.1 times the
+points' spacing plus this, in metres."""
 _ROLLED = math.radians(20.0)
 """Only a tilt of at least this, in radians, counts as caused by rolling."""
 _ROLLED_PITCH = math.radians(10.0)

@@ -20,8 +20,8 @@ _LEAST = 0.010
 _AMPLE = 0.060
 """Clearance beyond this, in metres, has no benefit: the open hand already has room."""
 _WAY = 0.02
-"""A position one metre farther from the wanted point is preferred only if its clearance is larger
-by this, in metres."""
+"""The additional clearance, in metres, that outweighs one metre more of distance from the wanted
+point."""
 
 
 def find_free_pose(

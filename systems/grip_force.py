@@ -29,8 +29,8 @@ _SOFT, _SOFT_SHARE = 0.006, 0.2
 """If the jaws sink farther into an object than `_SOFT`, in m, or than `_SOFT_SHARE` of its width,
 they press less."""
 _MUCH_LESS = 0.85
-"""If the jaws sink into an object, their force is lowered in steps. Each step lowers it to at most
-this fraction of the present force."""
+"""If the jaws sink into an object, their force is lowered only if it becomes at most this fraction
+of the present force."""
 _GENTLE, _GENTLEST = 0.5, 0.25
 """Fractions of the acceleration limits. An object that may turn is moved with at most `_GENTLE` of
 them; no object is moved with less than `_GENTLEST` of them."""
@@ -58,8 +58,8 @@ def grip_force(
 ) -> float:
     """The force of each pad on an object of a given weight, in N.
 
-    It is proportional to the weight up to `firm_grasp_force` at `heavy_load`, but at least
-    `grasp_force`. Beyond `heavy_load` it rises linearly to `peak_grasp_force` at `heaviest_load`.
+    Up to `heavy_load` it is proportional to the weight, but at least `grasp_force`; at `heavy_load`
+    it is `firm_grasp_force`. From there it rises linearly to `peak_grasp_force` at `heaviest_load`.
     A moment about the axis of the pads may require more, up to the peak. The force never falls
     while the object is held: with less force, an object that has begun to turn between the pads
     would turn further.
@@ -112,9 +112,8 @@ def gentleness(
 ) -> float:
     """The fraction of the acceleration limits that is used to move an object of a given weight.
 
-    It is 1 up to `heavy_load`. For heavier objects it is `heavy_load` / weight, but at least a
-    quarter. It is at most a half if the object may turn between the pads. It never rises while the
-    object is held.
+    It is 1 up to `heavy_load`, and inversely proportional to the weight above it. If the object may
+    turn between the pads, it is at most a half. It never rises while the object is held.
 
     Args:
         weight: the weight that the hand feels, in N.

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from systems.signals import PlanarPose
 
 _OUTSIDE = (0.15, 0.6)
-"""Range of the distance of the object's centre of mass outside the block's edge when the object is
-released. The unit is the width with which the object lies on the block."""
+"""Least and largest distance of the object's centre of mass beyond the block's edge when the object
+is released, as fractions of the width of the side that rests on the block."""
 _MOST_OUTSIDE = 0.008
-"""Largest distance of the centre of mass outside the edge, in metres."""
+"""Largest distance of the centre of mass beyond the edge, in metres."""
 _BESIDE = 0.005
 """The object must rest on the block on both sides of its centre of mass: at points that are more
 than this away from it along the edge, in metres."""

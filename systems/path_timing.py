@@ -114,7 +114,8 @@ class SmoothMotion:
     def __init__(self, position: NDArray[np.float64], averaged: int = AVERAGED) -> None:
         """
         Args:
-            position: (n, joints) a motion from rest to rest at every tick, before averaging.
+            position: (n, joints) positions at every tick, before averaging. The motion begins and
+                ends at rest.
             averaged: number of ticks over which the acceleration is averaged.
         """
         rest = [position[:1]] * 2, [position[-1:]] * (averaged + 2)

@@ -52,8 +52,8 @@ class Moment:
     contact: NDArray[np.float64]
     """(6) value of the planner's port `hand_contact_force`."""
     wrist_moment: float | None = None
-    """Value of the planner's port `wrist_moment`, in N m; None if it is not connected, or in
-    another mode than `LIFT`."""
+    """Value of the planner's port `wrist_moment`, in N m; None if it is not connected or
+    the mode is not `LIFT`."""
 
 
 class PickPlaceSteps:
@@ -200,7 +200,7 @@ class PickPlaceSteps:
             self.hold(moment)
 
     def _doubts_grip(self, moment: Moment, weight: float, turning: float) -> bool:
-        """Whether a trial lift must show first how the object hangs."""
+        """Whether a trial lift must first show how the object hangs."""
         state = moment.state
         if moment.wrist_moment is None or state.trusts_grip:
             return False

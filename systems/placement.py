@@ -32,7 +32,7 @@ GONE = 10.0
 appeared yet."""
 
 _FAR = 0.5
-"""When objects are assigned to goals, displacements are capped at this, in metres."""
+"""When objects are assigned to goals, displacements are limited to this, in metres."""
 _NEAR = 0.05
 """Objects farther than this from a goal, in metres, are assigned without a test whether they fill
 it."""

@@ -20,11 +20,10 @@ from kitting_drake.evaluation.intervals import proportion_interval
 from kitting_drake.scenario.choosing import find_scenario
 
 TOLERANCE_MM = 0.1
-"""The standard deviation of the error by which a printed cavity is wider or narrower, in mm on each
-side."""
+"""The standard deviation of the random error of the clearances, in mm on each side."""
 _OFF = "wrong height or heading"
 _TIGHT = ("insertion blocked", "misplaced", _OFF)
-"""The causes of failures that a wider cavity may mend."""
+"""The causes of failures that a wider cavity may prevent."""
 GOOD = 0.95
 """A kit fits if at least this share of the tools is kitted."""
 _CLEARLY = 3
@@ -155,8 +154,9 @@ def prove_kit(
 
     The policy is that of the kit's scenario. In each episode the tools lie at other poses. All
     cavities are wider or narrower by the same random error, with the standard deviation
-    `TOLERANCE_MM`. A kit that does not fit is tried again with wider cavities, if these may mend
-    its failures. A clearance at which the kit certainly does not fit gets no further episodes.
+    `TOLERANCE_MM`. A kit that does not fit is tried again with wider cavities, if these may
+    prevent its failures. A clearance at which the kit certainly does not fit gets no further
+    episodes.
 
     Args:
         folder: a folder that `hkd kit` wrote.

@@ -154,7 +154,7 @@ def _draw_shares(
     look: _Look,
     label: str,
 ) -> None:
-    """Draws, over x, the share of errors with a magnitude of at most x; None counts as infinite."""
+    """Draws the cumulative distribution of the errors' magnitudes. None counts as infinite."""
     known = [error for error in errors if error is not None]
     ordered = np.sort(np.clip(np.abs(known), *limits))
     shares = np.arange(len(known) + 1) / max(len(errors), 1)

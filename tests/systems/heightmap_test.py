@@ -97,7 +97,7 @@ def test_the_shadow_of_an_object_is_table():
     height[10:20, 10:20] = 0.02
     valid = np.ones(height.shape, bool)
     valid[10:20, 20:26] = False  # The object's shadow is six pixels wide.
-    valid[14:16, 13:15] = False  # A hole in the depths on top of the object.
+    valid[14:16, 13:15] = False  # Depths are missing on top of the object.
     filled = fill_unseen(np.where(valid, height, 0), valid)
     assert not filled[10:20, 20:26].any()
     np.testing.assert_array_equal(filled[14:16, 13:15], np.float32(0.02))

@@ -410,7 +410,7 @@ def test_an_object_on_the_rim_is_rotated_into_its_cavity(offset: float):
 
 @pytest.mark.parametrize(("doubt", "follows"), [(0.0, Mode.RELEASE), (0.002, Mode.SEARCH)])
 def test_the_rim_check_allows_for_the_doubt_of_the_heights(doubt: float, follows: Mode):
-    """If heights are doubtful, an object that stops slightly below the rim may stand on it."""
+    """If heights are doubtful, an object that stops just below the rim may in fact stand on it."""
     heights = dataclasses.replace(OVER_A_CAVITY.heights, doubt=doubt)
     world = World(touch_place=ON_THE_RIM - 0.0015)
     answer = dataclasses.replace(OVER_A_CAVITY, heights=heights)

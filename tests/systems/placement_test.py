@@ -234,7 +234,7 @@ def test_a_complete_stage_keeps_its_reward():
     assert (moved[1].success, moved[2].success) == (False, True)
     assert total_reward(goals, moved, kept) == 1.0
     assert total_reward(goals, at(row[0], away, top)) == 0.25
-    # No stage depends on the last one, so it is not kept.
+    # The last stage is not kept, because no other stage depends on it.
     assert complete_stages(goals, at(*row, top)) == kept
     assert strict_reward(goals, fallen) == 0.25
 

@@ -206,7 +206,7 @@ def test_the_median_of_frames_is_less_noisy_and_has_fewer_holes():
         )
     )
     errors = [float(np.std(image[image > 0] - 1.2)) for image in (one, five)]
-    # The median of five normal values has 0.536 times the standard deviation of one.
+    # The median of five normal values has 0.536 times the standard deviation of a single value.
     assert errors[0] == pytest.approx(0.002 * 1.2**2, rel=0.1)
     assert 0.5 < errors[1] / errors[0] < 0.62
     assert (one == 0).mean() > 0.05

@@ -36,7 +36,7 @@ class Outside:
     chamfer_mm: float = 0.0
     """The width of the bevel along the block's outer edges; zero for none."""
     gridfinity: bool = False
-    """Whether the block stands on Gridfinity's feet. Its sides are then those of `grid_side`."""
+    """Whether the block has Gridfinity's feet. Its sides must then be on the grid (`grid_side`)."""
 
     @property
     def raised_mm(self) -> float:

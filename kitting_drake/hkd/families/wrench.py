@@ -122,8 +122,8 @@ def _shoulders(p: WrenchParameters, head: Head, side: int) -> CrossSection:
 def _shank_cells(p: WrenchParameters) -> list[CrossSection]:
     """Returns regions that cut the shank into convex parts.
 
-    They leave out what a head covers. The list is empty if the shank is straight and a head that
-    needs shoulders has none. Tails and spikes need no shoulders.
+    They leave out what a head covers. The list is empty if the shank is straight and a head other
+    than a tail or a spike has no shoulders.
     """
     half, far = p.center_distance_mm / 2, 100.0
     if p.swing_mm:
@@ -145,7 +145,7 @@ def _shank_cells(p: WrenchParameters) -> list[CrossSection]:
 
 
 def _rectangle(x_low: float, x_high: float) -> CrossSection:
-    """Returns a rectangle between two values of x that is wider than any wrench."""
+    """Returns a rectangle, wider than any wrench, between two values of x."""
     return CrossSection.square((x_high - x_low, 200.0)).translate((x_low, -100.0))
 
 

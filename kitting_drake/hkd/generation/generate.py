@@ -44,7 +44,7 @@ VERTEX_TOLERANCE_MM = 0.2
 GRIP_TOLERANCE_MM = 0.06
 # The largest distance of an annotated grasp from the middle between the gripped faces.
 GRIP_CENTRING_MM = 0.2
-# The angle between faces above which their edge is shaded as a sharp edge.
+# An edge is shaded as sharp if the angle between its faces is larger than this.
 CREASE_ANGLE_DEG = 35.0
 # The lengths of pads and fingers along the tool, with a margin for an inexact grasp.
 PAD_LENGTH_MM = round(1e3 * PAD_LENGTH + 0.4, 3)

@@ -22,7 +22,7 @@ class Grip:
     """The least coordinate along the closing direction, measured from the point (x, y) of
     `find_grip`."""
     high: float
-    """The greatest coordinate along the closing direction, measured from the same point."""
+    """The greatest of these coordinates."""
     top: float
     """The greatest height of the surface between the jaws."""
 

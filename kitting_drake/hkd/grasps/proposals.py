@@ -133,7 +133,7 @@ def _propose(
             )
         if near:
             result.append(min(near, key=lambda p: p.cost))
-    # Measure heights on the triangles, because the slices resolve them only to their spacing.
+    # Measure heights on the triangles, because the slices are too far apart for exact heights.
     result = [replace(p, surface_height=_top(triangles, p)) for p in result]
     return sorted(result, key=lambda p: p.cost)
 

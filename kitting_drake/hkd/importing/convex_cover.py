@@ -114,7 +114,8 @@ def _cut_points(part: CrossSection) -> list[Array]:
 def _grown(seed: int, cells: list[CrossSection], outer: CrossSection) -> set[int]:
     """Grows a hull within `outer` from the cell `seed` and returns the indices of its cells.
 
-    Each step adds the cell for which the hull gains the least area besides the cell itself.
+    Each step adds the cell for which the new hull covers the least area outside both the old hull
+    and the cell.
     """
     hull, members, candidates = cells[seed].hull(), {seed}, set(range(len(cells))) - {seed}
     while True:
@@ -166,7 +167,7 @@ def _between(normals: Array, offsets: Array) -> CrossSection:
 
 
 def _needed(polygons: list[CrossSection], inner: CrossSection) -> list[CrossSection]:
-    """Drops polygons that are not needed to cover `inner`. Tries the smallest first."""
+    """Drops polygons, the smallest first, as long as the others still cover `inner`."""
     kept = list(polygons)
     for polygon in sorted(polygons, key=CrossSection.area):
         rest = [other for other in kept if other is not polygon]

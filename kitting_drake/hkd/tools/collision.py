@@ -48,12 +48,12 @@ def closed(profile: CrossSection, clearance: float) -> CrossSection:
 def furthest(
     inner: CrossSection, outer: CrossSection, precision: float = 0.01, area: float = _AREA
 ) -> float:
-    """Returns the largest distance in mm of a point of `inner` from `outer`, or 5 if it is larger.
+    """Returns the largest distance of a point of `inner` from `outer` in mm, but at most 5.
 
     Args:
         inner, outer: two regions, in mm.
         precision: the precision of the distance, in mm.
-        area: the area of `inner`, in mm^2, that may lie farther away.
+        area: parts of `inner` with less than this area in total, in mm^2, may lie farther away.
     """
     low, high = 0.0, 5.0
     while high - low > precision:
@@ -152,8 +152,8 @@ def _fits(hull: _Hull, allowed: CrossSection, tolerance: float) -> bool:
 
 
 def _merged(hulls: list[_Hull], allowed: CrossSection, tolerance: float) -> list[_Hull]:
-    """Merges pairs of hulls until `_fits` allows no further pair. The pair that adds the least
-    volume is always merged first."""
+    """Merges hulls as long as `_fits` allows it. Each step merges the pair that adds the least
+    volume."""
     alive = dict(enumerate(hulls))
 
     def options(a: int, b: int) -> list[tuple[float, int, int]]:

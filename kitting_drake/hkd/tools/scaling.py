@@ -25,7 +25,7 @@ _SAME_LENGTH = 1e-9
 _EASY_MOMENT = 0.2
 """The moment about the axis through both pads that the grip holds easily, in N m."""
 _WIDEST = MAX_OPENING - 0.015
-"""The width in metres above which `other_grasps` of a scaled tool are dropped."""
+"""The largest width of the `other_grasps` of a scaled tool, in metres; wider ones are dropped."""
 
 _DRAKE = "http://drake.mit.edu"
 
@@ -105,7 +105,8 @@ def weighted_tool(tool: Tool, mass: float) -> Tool:
 
 
 def _excess_moment(grasp: Grasp, root: ElementTree.Element, mass: float) -> float:
-    """Returns the weight's moment about the pads beyond `_EASY_MOMENT`, in N m; at least 0."""
+    """Returns by how much the weight's moment about the pads exceeds `_EASY_MOMENT`, in N m; zero
+    if it does not."""
     pose = root.findtext(".//inertial/pose") or "0 0"
     x, y, *_ = map(float, pose.split())
     lever = (x - grasp.x) * math.cos(grasp.theta) + (y - grasp.y) * math.sin(grasp.theta)

@@ -32,7 +32,7 @@ def tool_pools(split: str) -> dict[str, list[str]]:
 def toolsets(split: str) -> list[tuple[str, ...]]:
     """Returns the toolsets of a split, each in the order of `CATEGORIES`.
 
-    These are `TOOLSET_COUNT` different toolsets, or all combinations of tools if these are fewer.
+    There are `TOOLSET_COUNT` different toolsets, or fewer if the tools have fewer combinations.
     The draw is deterministic.
 
     Raises:

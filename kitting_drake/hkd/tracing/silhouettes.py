@@ -23,8 +23,7 @@ _FLAT_MM = 0.03
 _EDGE_SLACK_MM = 0.4
 """Strips in which two masks differ are ignored if they are narrower than twice this, in mm."""
 _BORDER_SLACK_MM = 3.3
-"""The width, in mm, of the strip in which the true border lies where a tool blends into a
-shadow."""
+"""Where a tool blends into a shadow, the true border lies in a strip of this width, in mm."""
 _STRETCH_GAP_MM = 2.0
 """The largest gap between the parts of one stretch of unclear border, in mm."""
 

@@ -17,12 +17,11 @@ _NO_SHADOW = 1.3
 _BALL_MM = 0.9
 """The radius of the disc that `_reached` rolls over the ground, in mm."""
 _ROUGH = 0.022
-"""Any surface with less roughness than this, in logarithms of light, is even for `MIDDLE`."""
+"""A surface of at most this roughness, in logarithms of light, is always smooth for `MIDDLE`."""
 _MOST_FINE = 0.1
 _HOLE_BALL_MM = 0.6
 _STRIP_MM = 1.2
-"""In `_shaded_holes`, an eroded region counts as a strip if half its width, in mm, is at most
-this."""
+"""An eroded region in `_shaded_holes` counts as a strip if it is at most twice this wide, in mm."""
 _EDGE_MM = 2.3
 """The distance by which the ground is extended over the rough pixels at an edge, in mm."""
 _SHINE_STEEP = 0.6
@@ -43,8 +42,8 @@ region that must be brighter than the ground."""
 _BAY_MM = 12.0
 """Bays and holes up to twice this wide, in mm, may be reflections."""
 _BLENDED_MM, _SHADED = 1.2, 0.06
-"""The least width, in mm, of a step of light at which a tool blends into its surroundings; and the
-least darkness of a shadow, in logarithms of light."""
+"""A tool blends into a shadow where the step of light is wider than `_BLENDED_MM` and the shadow is
+darker than `_SHADED`, in logarithms of light."""
 _NEUTRAL = 0.05
 """The largest difference in colour between shaded and lit ground, in logarithms of light."""
 _LARGEST_HOLE_MM2 = 500.0
@@ -65,17 +64,17 @@ class ShadowLook:
     rough: float
     """The largest ratio of a shadow's roughness to that of the plain ground."""
     shine: float
-    """The width in mm above which a step of light is soft. A bay or hole is a reflection if its
+    """A step of light is soft if it is wider than this, in mm. A bay or hole is a reflection if its
     border with the tool is soft on at least 30 % of its length."""
 
 
 CAREFUL = ShadowLook(0.3, 2.0, 1.2)
-"""The limits for high tools, whose shadows have soft edges: faint edges belong to tools."""
+"""The limits for high tools. Their shadows have soft edges, so faint edges count as tool edges."""
 MIDDLE = ShadowLook(0.45, 3.0, 1.2)
 """The limits for low tools and for tools of unknown height."""
 BOLD = ShadowLook(0.65, 4.0, math.inf)
-"""The limits for a second opinion: faint edges belong to shadows. Where the mask for these limits
-differs from that for other limits, the outline is in doubt."""
+"""The limits for a second opinion: faint edges count as shadow edges. The outline is in doubt where
+the mask for these limits differs from the mask for `CAREFUL` or `MIDDLE`."""
 _LOW_MM = 9.0
 _COARSE_PX_PER_MM = 3.5
 _FINE_PX_PER_MM = 5.0
@@ -258,7 +257,8 @@ def _median(values: Array, otherwise: float) -> float:
 
 
 def _lightness_and_colour(cv2: Any, logs: Array) -> tuple[Array, Array]:
-    """Returns the mean of each pixel's three logarithms, and their largest deviation from it."""
+    """Returns two values for each pixel: the mean of its three logarithms, and the largest
+    deviation of a logarithm from this mean."""
     lightness = cv2.transform(logs, np.full((1, 3), 1 / 3, np.float32))
     colour = np.zeros_like(lightness)
     for k in range(3):
@@ -286,7 +286,7 @@ def _roughness(cv2: Any, light: Array, even: Array, px_per_mm: float) -> Array:
 def _reached(cv2: Any, even: Array, plain: Array, px_per_mm: float) -> Array:
     """Finds the pixels that a rolling disc can cover.
 
-    The disc starts on plain ground and rolls over `even` pixels only.
+    The disc starts on plain ground, and all pixels below it must be smooth.
 
     Args:
         cv2: OpenCV.

@@ -3,8 +3,8 @@
 The place is refined by fitting the object's outline to the recess. The fit corrects errors of
 millimetres and degrees. It also decides between two rotations that differ by half a turn, even for
 an object whose two ends differ little. If the outlines do not agree, for instance because the
-recess is hidden or there is none, the prediction stays as it is. A grasp is replaced if the jaws
-would hit something there. This is not in the paper.
+recess is hidden or there is none, the prediction stays as it is. A grasp at which the jaws
+would hit something is replaced. This is not in the paper.
 """
 
 from __future__ import annotations
@@ -61,9 +61,10 @@ _MUCH_WORSE = 0.5
 """A predicted grasp is replaced only if its `JawGrasp.cost` exceeds that of the best grasp nearby
 by at least this."""
 _SAME_PLACE = 0.008
-"""The distance, in metres, below which two grasps with similar angles count as the same."""
+"""Two grasps with similar angles count as the same if they are closer than this, in metres."""
 _SAME_ANGLE = math.radians(8)
-"""The angle, in radians, below which two grasps at similar places count as the same."""
+"""Two grasps at similar places count as the same if their angles differ by less than this, in
+radians."""
 _NEAR = 6.0
 """A position belongs to a region if their distance is less than this, in pixels."""
 

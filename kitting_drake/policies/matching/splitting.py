@@ -33,11 +33,10 @@ _ANGLES = 72
 _STARTS = 5
 """The number of initial poses that are refined for each recess."""
 _OUTSIDE = 3.0
-"""In the search for poses, the penalty of each pixel of the recess that lies outside the region. A
-pixel inside the region scores 1."""
+"""In the search for poses, a pixel of the recess scores 1 inside the region, and minus this
+outside."""
 _NOTCH = 0.3
-"""In the search for poses, the score of each pixel of the recess that lies in a narrow notch of the
-region."""
+"""In the search for poses, a pixel of the recess scores this in a narrow notch of the region."""
 _RIM = 1.5
 """In the search for poses, the weight of the agreement between the outlines. The mean score of the
 recess's pixels has the weight 1."""

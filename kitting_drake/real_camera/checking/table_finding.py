@@ -48,7 +48,7 @@ _ABOVE_FLOOR = 0.25
 """A level plane that is higher than the largest plane by more than this, in metres, is the table.
 The largest plane is then the floor."""
 _TABLE_SHARE = 0.1
-"""The least number of points of a table above a floor, as a share of the floor's points."""
+"""A table above a floor must have more than this share of the number of the floor's points."""
 _BAND = 0.006
 """Points within this distance of the plane, in metres, belong to it. Three times the noise is used
 if that is larger."""
@@ -58,21 +58,21 @@ not part of the table."""
 _TALL = 1.2
 """Points that are higher above the table than this, in metres, are ignored."""
 _CLOSED = 0.035
-"""Gaps in the table are closed if they are narrower than twice this, in metres. Such gaps come from
+"""Gaps in the table are closed if they are at most twice this wide, in metres. They come from
 objects and shadows."""
 _KIT = 0.03
 """An object at the table's edge counts as part of the table if it is at least twice this wide, in
 metres. Narrower things, such as profiles along the edge, do not count."""
 _LEAST_TALL = 0.02
-"""The width below which tall things count as noise, in metres."""
+"""Tall things narrower than this, in metres, count as noise."""
 _AROUND = 0.02
 """The width of the margin around tall things, in metres. Tall things and their margins are
 ignored."""
 _TOO_NEAR = 0.25
 """An arm cannot pick within this distance of the middle of its base, in metres."""
 _ENOUGH = 0.6
-"""Workspaces nearer to the base than `_TOO_NEAR` are excluded, unless all others hold less than
-this share of the largest possible table area."""
+"""Workspaces nearer to the base than `_TOO_NEAR` are excluded if a workspace farther away holds
+more than this share of the largest possible table area."""
 _NEARLY = 0.97
 """Workspaces count as equally good if they hold at least this share of the table area of the best
 one. The nearest of them is chosen."""

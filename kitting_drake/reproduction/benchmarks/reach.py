@@ -30,7 +30,7 @@ _LOWEST = 0.02
 _SPACING, _COARSE = 0.025, 0.10
 """The spacing of the map's points, and of the points for the search, in m."""
 _AROUND = 0.8
-"""The largest distance of a searched base from the workspace, in m."""
+"""Bases are tried up to this distance from the workspace, along x and along y, in m."""
 _STEP, _FINER = 0.10, 0.05
 """The spacing of the bases in the first search, and in the second search, in m. The second search
 is around the best bases of the first."""

@@ -51,7 +51,7 @@ _WITHOUT_KIT = 0.1
 """The share of scenes without a kit."""
 _DECISIONS = 3
 """The largest number of decisions of a policy in a scene. Each avoids the tools of the earlier
-ones."""
+decisions."""
 LEAST_CONFIDENCE = 0.9
 """The confidence below which a robot does not act. This threshold is not fitted: confidence is a
 probability of success, so the threshold follows from the cost of a wrong action."""

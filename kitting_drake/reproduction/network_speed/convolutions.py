@@ -47,8 +47,8 @@ class Convolutions:
     """
 
     calls: Counter[tuple[Any, tuple[Any, ...]]]
-    """The number of calls, by torch's function and its arguments; tensors are replaced by
-    outlines."""
+    """The number of calls, by torch's function and its arguments. An `_Outline` stands for each
+    tensor."""
 
     @classmethod
     def of(cls, function: Callable[[], object]) -> Convolutions:

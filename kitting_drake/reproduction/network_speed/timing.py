@@ -55,7 +55,7 @@ def time_each(
     repeats: int,
     budget: float,
 ) -> dict[Name, Timing]:
-    """Times functions in alternation, so that all share the effect of other load on the machine.
+    """Times functions in alternation, so that other load on the machine slows all of them alike.
 
     Args:
         functions: the functions by name.

@@ -164,7 +164,8 @@ class Run:
 
     @property
     def paper_task(self) -> str | None:
-        """The title of the paper's task; None if anything but the policy differs from that task."""
+        """The title of the paper's task; None if the run departs from this task in more than the
+        policy."""
         task = self.summary["task"]
         return task if task in PAPER_TASKS and not self.departures else None
 

@@ -126,8 +126,10 @@ def departures(results: Mapping[str, Result]) -> str:
 def _compared(
     results: Mapping[str, Result], what: str, pairs: Mapping[str, tuple[str, str]]
 ) -> str:
-    """Writes the differences between pairs of cells with results, in percentage points by the
-    paper's measure."""
+    """Writes the difference of each pair of cells in the paper's measure, in percentage points.
+
+    Pairs without results are left out.
+    """
     found = []
     for label, (one, other) in pairs.items():
         if one in results and other in results:

@@ -31,8 +31,8 @@ actions. On any other task it is one action per object."""
 
 @dataclass(frozen=True)
 class Changeable:
-    """The least and the largest number of actions that the memory of failed grasps can have
-    changed, and the number of all actions."""
+    """Bounds on the number of actions that the memory of failed grasps can have changed, and the
+    number of all actions."""
 
     at_least: int
     at_most: int

@@ -157,7 +157,7 @@ def draw_table_1(results: Mapping[str, Result]) -> bytes:
 
 
 def _draw_task(axis: Axes, task: str, column: int, results: Mapping[str, Result]) -> None:
-    """Draws the panel of a task: our cells, and the paper's figures for those without
+    """Draws the panel of a task: our cells, and the paper's figures for our cells without
     extensions."""
     for index, ((method, n), (colour, marker)) in enumerate(_ROWS.items()):
         for place, count in enumerate(sorted(RAVENS_DEMONSTRATIONS)):

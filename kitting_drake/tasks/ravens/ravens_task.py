@@ -62,8 +62,7 @@ class RavensTask(TaskConfig):
         if X_WB[index].rotation().matrix()[2, 2] < _UPRIGHT:
             return TOPPLED
         if scene.success.share(placement, X_WB[index]) > 1 - 1e-9:
-            # The object is in place, but a goal that must be filled before the object's goal is
-            # not.
+            # The object is in place, but another goal, which must be filled first, is not filled.
             return PREREQUISITE_MISSING
         return cause
 

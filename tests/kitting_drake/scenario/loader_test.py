@@ -84,7 +84,7 @@ A:
 
 
 def test_text_keeps_the_order_of_mappings(tmp_path: Path):
-    """The order matters: the oracle picks tools in it, and the last paint that matches wins."""
+    """The order matters: the oracle picks tools in this order, and the last matching paint wins."""
     path = write(tmp_path, "A: {}")
     text = """
 task: !ArrangedKitting {tools: {slip_joint_pliers: {x: 0.3, y: 0.3}, claw_hammer: {x: 0.6, y: 0.3}}}

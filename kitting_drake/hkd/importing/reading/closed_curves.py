@@ -28,12 +28,12 @@ FRAMES = ("page", "tool")
 _JOIN_MM = 0.1
 """The largest gap between the ends of two curves that are joined, in mm."""
 _POINT_MM = 0.002
-"""Curves up to this size, in mm, are dropped as points."""
+"""A curve of at most this size, in mm, counts as a point and is dropped."""
 _SAME_MM = 0.05
 """Two curves at most this far apart, in mm, count as one curve that is drawn twice."""
 _LEAST_AREA_MM2 = 1.0
 _LINE_MM = 1.5
-"""Two outlines closer than this, in mm, count as the two sides of one thick line."""
+"""Two outlines less than this far apart, in mm, count as the two sides of one thick line."""
 _BOX = 0.9
 """A curve counts as a rectangle if it fills at least this share of its bounding box."""
 _THE_PAGE = "the page"
@@ -299,7 +299,10 @@ def _merged_lines(curves: list[Curve]) -> list[Curve]:
 
 
 def _without_doubles(curves: list[Points]) -> list[int]:
-    """Returns the indices, in order, of the curves that do not lie on a longer or earlier one."""
+    """Returns the indices of the curves to keep, in order.
+
+    A curve that lies on a longer one, or on an earlier one of the same length, is left out.
+    """
     if len(curves) < 2:
         return list(range(len(curves)))
     lengths = np.array([np.linalg.norm(np.diff(c, axis=0), axis=1).sum() for c in curves])

@@ -37,7 +37,7 @@ class Curve:
 
 @dataclass(frozen=True)
 class DrawnCurves:
-    """The curves of a drawing, and what gives their scale."""
+    """The curves of a drawing, and how its scale was found."""
 
     curves: list[Curve]
     measured: str

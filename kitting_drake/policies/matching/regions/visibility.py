@@ -25,21 +25,21 @@ _MARGIN = 0.010
 _AROUND = 5
 """The side, in pixels, of the square around a pick. More than half of the square must be seen."""
 _LANDING = 0.5
-"""The least share that must be seen of the area under each finger of the open jaws."""
+"""At least this share of the area under each finger of the open jaws must be seen."""
 _SWEPT = 0.5
-"""The least share that must be seen of the area between the fingers of the open jaws."""
+"""At least this share of the area between the fingers of the open jaws must be seen."""
 _LINES, _DEPTHS, _SWEEPS = 5, 4, 17
 """The numbers of samples along the pads, across a finger, and from finger to finger."""
 _INSIDE = 0.9
 """The least share of a placed object that must lie within the workspace."""
 _OUT_OF_VIEW = 0.02
-"""The largest share of a placed object that may lie outside all cameras' views."""
+"""The largest share of a placed object and its surroundings that may lie outside all views."""
 _RING = 3
 """How far the surroundings of a placed object extend from it, in pixels."""
 _RING_SEEN = 0.5
-"""The least share that must be seen of the surroundings of a placed object."""
+"""At least this share of the surroundings of a placed object must be seen."""
 _PLACE_SEEN = 0.25
-"""The least share that must be seen of the area in which a placed object will lie."""
+"""At least this share of the area in which a placed object will lie must be seen."""
 _BLIND = 0.020
 """The radius that is assumed for an object of unknown outline, in metres."""
 

@@ -201,7 +201,7 @@ def test_the_length_does_not_depend_on_the_drawings_rotation(tmp_path: Path):
 
 
 def test_a_scaled_drawing_still_asks_whether_its_rectangle_is_a_frame(tmp_path: Path):
-    # The frame is 950 units long, but 190 mm: it could be a tool.
+    # The frame is 950 units long, which is only 190 mm, so it could be a tool.
     path = tmp_path / "tool.svg"
     path.write_text(
         '<svg xmlns="http://www.w3.org/2000/svg" width="200mm" viewBox="0 0 1000 400">'

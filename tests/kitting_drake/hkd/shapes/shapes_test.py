@@ -88,7 +88,7 @@ def test_the_hulls_of_a_ring_leave_its_hole_open():
 
 
 def test_a_mesh_is_scaled_as_in_ravens(tmp_path: Path):
-    """A triangle whose sides are 20 units becomes one of 60 mm, held by a corner and a side."""
+    """A triangle with sides of 20 units is scaled to 60 mm. It is held by a corner and a side."""
     triangle = CrossSection(
         [20 / 3**0.5 * np.array([(1, 0), (-0.5, 0.75**0.5), (-0.5, -(0.75**0.5))])]
     )

@@ -89,7 +89,7 @@ def test_other_rotations_are_nearly_exact(frequencies: tuple[int, ...], median: 
                 expected = output @ rho(frequencies, degrees).T
                 found = network(rotate_image(crop, degrees))
                 errors.append(float((found - expected).norm() / expected.norm()))
-    # The bounds depend on the frequencies: high ones are less exact on a pixel grid.
+    # The bounds depend on the frequencies: high frequencies are less exact on a pixel grid.
     assert np.median(errors) < median
     assert np.max(errors) < most
 

@@ -106,7 +106,7 @@ def losses(steps: int) -> list[dict[str, float]]:
     trainer = Trainer(make_networks(TINY), seed=0, learning_rate=1e-3)
     found = []
     for _ in range(steps):
-        # Random draws depend on the step number. At number 0 the scene always moves the same way.
+        # Random draws depend on the step number, so keep it at 0 to move the scene alike each time.
         trainer.step_count = 0
         found.append(trainer.step([sample()]))
     return found

@@ -254,7 +254,7 @@ def test_drawn_bins_represent_all_bins():
         ({3, 4}, 18, 2, 14),
         ({3, 4}, 36, 2, 32),
         ({3, 4}, 99, 2, 32),
-        # If fewer bins than the default are requested, the default number is drawn.
+        # At least the default number of bins is drawn, even if fewer are requested.
         ({3, 4}, 1, 2, 2),
         ({3}, 9, 2, 6),
         (set(), 9, 0, 9),

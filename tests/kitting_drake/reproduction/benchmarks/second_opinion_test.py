@@ -1,4 +1,4 @@
-"""The second opinion by MuJoCo is about the right tool at the right pose."""
+"""MuJoCo, as a second opinion, agrees with most of Drake's verdicts."""
 
 from types import SimpleNamespace
 

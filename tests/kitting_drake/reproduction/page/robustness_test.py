@@ -54,7 +54,7 @@ def run(
 
 
 def rows(table: str) -> dict[str, list[str]]:
-    """The cells of each row, by the row's label; of rows with the same label, the last one."""
+    """The cells of each row, by the row's label. If rows share a label, the last one counts."""
     lines = [line.strip("|").split("|") for line in table.splitlines() if "|" in line]
     return {line[0].strip(): [cell.strip() for cell in line[1:]] for line in lines}
 

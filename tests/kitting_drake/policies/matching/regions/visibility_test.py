@@ -33,7 +33,7 @@ def visibility(unseen: tuple[slice, slice], *, in_view: bool) -> Visibility:
         ((slice(75, 86), slice(172, 180)), True, 0.0, False),
         ((slice(75, 86), slice(172, 180)), True, np.pi / 2, True),
         ((slice(79, 81), slice(172, 180)), True, 0.0, True),
-        # Nothing under the jaws may be out of view.
+        # Everything under the jaws must be within the view.
         ((slice(80, 81), slice(176, 177)), False, 0.0, False),
         ((slice(110, 160), slice(0, 320)), False, 0.0, True),
     ],
