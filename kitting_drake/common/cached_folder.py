@@ -67,8 +67,8 @@ def _is_complete(folder: Path, files: Sequence[str]) -> bool:
 def prune(parent: Path) -> None:
     """Removes the least recently used folders in `parent`.
 
-    The `KEPT_ENTRIES` most recently used folders are kept, and all folders that were used less than
-    `YOUNGEST_REMOVED` ago. Older scratch folders of killed processes are removed as well.
+    It keeps the `KEPT_ENTRIES` most recently used folders, and all others that were used within the
+    last `YOUNGEST_REMOVED` seconds. Older scratch folders of killed processes are removed as well.
     """
     entries: list[tuple[float, Path]] = []
     for path in parent.iterdir():

@@ -51,8 +51,8 @@ def separation(a: Polygon, b: Polygon) -> float:
     """Measures how far two convex polygons are apart.
 
     Returns:
-        The widest gap between them along a normal of one of their sides, in metres. It is at most
-        their distance, and negative if and only if they overlap.
+        The widest gap between them along a normal of one of their sides, in metres. The gap never
+        exceeds their distance, and is negative if and only if they overlap.
     """
     gaps = [
         ((corners @ normals.T).min(axis=0) - (own @ normals.T).max(axis=0)).max()

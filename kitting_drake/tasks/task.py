@@ -76,7 +76,7 @@ class Arrivals:
     """Objects that appear one at a time during an episode. Each is outside the cell until it
     appears.
 
-    The next object appears when the hand retreats or observes and no object's origin is over
+    The next object appears while the hand retreats or observes, if no object's origin is over
     `area`.
     """
 

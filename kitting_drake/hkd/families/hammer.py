@@ -135,7 +135,7 @@ def _handle(p: HammerParameters) -> tuple[Shape, Shape]:
     top = p.cheek_height_mm / 2 + PROUD_MM
     end = top - p.length_mm
     eye, throat, swell = p.eye_width_mm, p.throat_width_mm, p.swell_width_mm
-    # Each row has a distance from the handle's end, as a share of the handle's length, and a width.
+    # Each row: the distance from the handle's end (as a share of its length), and the width.
     # Behind the head the flanks are parallel, because a gripper holds the handle there.
     bare = [
         (1.0, 0.86 * eye),

@@ -196,8 +196,7 @@ def _grip(p: PliersParameters) -> Shape:
     tangent = np.gradient(path, axis=0)
     run = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
     start = run[-1] - p.grip_length_mm
-    # Each row is a share of the sleeve's length, a share of the grip's width, and a share of its
-    # thickness.
+    # Each row holds shares of the sleeve's length, of the grip's width and of the grip's thickness.
     stations = [
         (0.0, 0.80, 0.82),
         (0.012, 1.02, 0.92),

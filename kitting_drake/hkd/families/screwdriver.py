@@ -217,8 +217,8 @@ def _handle_section(p: ScrewdriverParameters, x: float, width: float, flute: flo
 def _handle(p: ScrewdriverParameters) -> tuple[Shape, Shape]:
     """Builds the fluted grip, and the smooth dark collar with a guard at its front."""
     length, width, neck = p.handle_length_mm, p.handle_width_mm, p.handle_width_mm - p.neck_depth_mm
-    # Each row has the distance from the rear end as a share of the length, the width, and a share
-    # of the flutes' depth.
+    # Each row: the distance from the rear end (as a share of the length), the width, and the depth
+    # of the flutes (as a share of their full depth).
     stations = [
         (0.0, 0.55 * width, 0.0),
         (0.012, 0.72 * width, 0.0),

@@ -89,7 +89,7 @@ def _put(profile: CrossSection, x: float, turn_deg: float) -> CrossSection:
 
 
 def _set(part: Part, x: float, turn_deg: float) -> Part:
-    """Moves a part, built about the origin with its axis along +x, to its head."""
+    """Moves a part to a head. The part was built about the origin, with its axis along +x."""
     c, s = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
     R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     solid = part.solid.rotate((0.0, 0.0, turn_deg)).translate((x, 0.0, 0.0))

@@ -73,8 +73,8 @@ class Report:
     bottom_error_mm: float
     top_error_mm: float
     grip_error_mm: float
-    # How much the position of a gripped face varies along the pads, and how far the tool between
-    # the fingers stands out beyond the gripped faces.
+    # How much the position of a gripped face varies along the pads, and how far any part of the
+    # tool between the fingers stands out beyond the gripped faces.
     grip_flatness_mm: float
     finger_overhang_mm: float
     # The tilt of the stable pose relative to the design's pose.
@@ -264,7 +264,7 @@ class _GripReport:
     width: float
     # How much the position of a gripped face varies along the pads.
     flatness: float
-    # How far the tool between the fingers stands out beyond the gripped faces.
+    # How far any part of the tool between the fingers stands out beyond the gripped faces.
     overhang: float
     # The height of the tool's top at the grasp.
     top: float

@@ -43,8 +43,8 @@ def corner_cost(left: Array, right: Array, column: float, touch: float) -> float
             the left pad, in metres.
         right: (columns, levels) the same coordinate of the surface under the right pad.
         column: the length of a column, in metres.
-        touch: a pad touches the parts of a face that are at most this far behind its foremost
-            point, in metres.
+        touch: a pad touches the parts of a face that are at most this far behind the face's
+            foremost point, in metres.
     """
     behind = [(left.max() - left).min(axis=1), (right - right.min()).min(axis=1)]
     spans = [column * np.flatnonzero(depth <= _SOFT) for depth in behind]

@@ -107,8 +107,8 @@ def find_holds(
     Args:
         reach: the extents of the tool.
         centres: (n) the columns to try; the pads' middle is at the lower edge of a column.
-        touch: a pad touches the parts of the surface that are at most this far behind its foremost
-            point, in metres.
+        touch: a pad touches the parts of a face that are at most this far behind the face's
+            foremost point, in metres.
         planner: the planner's parameters; the pads' depth and their clearance to the table are
             used.
         corners: whether a corner may be held.

@@ -36,7 +36,7 @@ FLOOR_CLEARANCE = PLANNER.floor_clearance
 RELEASE_REACH = PLANNER.release_clearance + FINGERTIP_DEPTH
 """The distance beyond the gripped faces that the fingertips need when they release."""
 
-# A pad touches the parts of the surface that are at most this far behind its foremost point. The
+# A pad touches the parts of a face that are at most this far behind the face's foremost point. The
 # first value is for the fine search, the second one for the coarse search.
 _TOUCH = 0.0003
 _COARSE_TOUCH = 0.0008
@@ -64,7 +64,7 @@ class GraspProposal(Grasp):
     slope: float
     """The inward lean of the gripped faces at the pads' lower edges, in radians."""
     overhang: float
-    """The distance by which the tool between the fingers stands out beyond the gripped faces, in
+    """How far any part of the tool between the fingers stands out beyond the gripped faces, in
     metres."""
     penalties: dict[str, float] = field(default_factory=dict)
     """The terms of the cost, by their causes."""
@@ -189,11 +189,11 @@ def _search(
         levels: the heights of the slices, in metres.
         com: (2,) the centre of mass in T, in metres.
         theta: the rotation of the hand, in radians.
-        touch: a pad touches the parts of the surface that are at most this far behind its foremost
-            point, in metres.
+        touch: a pad touches the parts of a face that are at most this far behind the face's
+            foremost point, in metres.
         planner: the planner's parameters.
         corners: whether a corner may be held.
-        near: (2,) the point in T close to which to search; None searches along the whole tool.
+        near: (2,) the point in T near which to search; None searches along the whole tool.
     """
     reach = reach_of(points, level, levels, theta)
     first, last = FINGER_COLUMNS, len(reach.left) - FINGER_COLUMNS

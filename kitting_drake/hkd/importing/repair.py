@@ -38,7 +38,7 @@ _MOST_COMPONENTS = 3000
 _VOXEL_MM = 0.75
 # The largest share of a hollow's volume that may lie outside the body around it.
 _OUTSIDE = 0.01
-# A mesh that fills less than this share of its bounding box counts as one without volume.
+# A mesh has no volume if it fills less than this share of its bounding box.
 _HOLLOW = 0.002
 
 Array = NDArray[np.float64]

@@ -25,7 +25,7 @@ _SETTLED = 1e-6
 
 @dataclass(frozen=True)
 class Seat:
-    """The pose of a tool in the frame C of the tool for which its cavity was made."""
+    """The pose of a tool in a cavity, in the frame C of the tool for which the cavity was made."""
 
     x: float
     y: float

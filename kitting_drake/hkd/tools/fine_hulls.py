@@ -20,7 +20,7 @@ INSIDE_MM = 0.04
 NOTCH_MM = 3.0
 """Half the width of the widest notches that hulls may bridge, in mm. Cavities bridge them too."""
 _HEIGHT_MM = 0.2
-"""The tolerance in mm for thinning a hull's vertices; that for the outline is finer."""
+"""The tolerance in mm for thinning a hull's vertices. The outline has a finer tolerance."""
 _AREA = 2e-3
 """A region counts as inside another one if at most this area (mm^2) of it lies outside."""
 # A piece is cut at a height if the cut makes its hull smaller by more than the share `_SHARE` and

@@ -47,7 +47,7 @@ Shift = NDArray[np.float64]
 class Difference:
     """The difference between a tool and its rotated copy.
 
-    Each measure is taken at the translation of the copy that makes this measure least.
+    For each measure, the copy is translated to make that measure as small as possible.
     """
 
     outline_deviation_mm: float
@@ -118,7 +118,8 @@ def measure_rotation(
 
     shift, _ = _minimum(uncommon_area, np.zeros(2), 2.0)
     outline_deviation = deviation(shift)
-    # If the deviation is twice the limit, assume that no translation brings it below the limit.
+    # If the deviation is at least twice the limit, assume that no translation brings it below the
+    # limit.
     if complete or outline_deviation < 2 * MOST_OUTLINE_DEVIATION_MM:
         outline_deviation = _minimum(deviation, shift, 0.5)[1]
     if not complete and outline_deviation >= MOST_OUTLINE_DEVIATION_MM:

@@ -140,7 +140,7 @@ def trace_outline(mask: Mask, resolution: float, *, close: bool = False) -> Outl
 
 
 def closed(mask: Mask, resolution: float) -> Mask:
-    """Fills narrow notches and all holes of a mask, as in an object's recess.
+    """Fills narrow notches and all holes of a mask, because the object's recess has none of them.
 
     The mask must have a margin of False pixels.
     """

@@ -177,8 +177,8 @@ class TransporterNetworks(Networks):
         """Predicts f_place over all pixels and, for N up to 36, at all rotations.
 
         For larger N, 36 nearly evenly spaced rotations are evaluated first. The three best peaks
-        are then refined: at the pixels near a peak, all bins between the two neighbouring ones of
-        the 36 rotations are evaluated.
+        are then refined: all bins from the previous to the next of the 36 rotations are evaluated
+        at the pixels near the peak.
         """
         shape = (image.shape[1], image.shape[2])
         step = math.tau / orientations
@@ -345,7 +345,8 @@ def _sampled(
     sources = []
     for angle in angles:
         cos, sin = math.cos(angle), math.sin(angle)
-        # Sample each pixel at its inverse rotation, as (col, row) from -1 to 1.
+        # Rotate each pixel of the result back to find where to sample the image. `grid_sample`
+        # takes these positions as (col, row), from -1 to 1.
         source_row = cos * row + sin * col + (centre[0] - (rows - 1) / 2)
         source_col = cos * col - sin * row + (centre[1] - (cols - 1) / 2)
         source = [source_col * (2 / (cols - 1)), source_row * (2 / (rows - 1))]

@@ -120,7 +120,7 @@ def _graph(network: nn.Module, example: Tensor, *, any_size: bool) -> bytes:
         warnings.catch_warnings(),
         torch.no_grad(),
     ):
-        # The exporter warns about traced shape checks and that it is deprecated. The newer exporter
+        # This exporter warns about traced shape checks and about its own deprecation. The newer one
         # takes a minute per network instead of a second.
         warnings.simplefilter("ignore")
         file = Path(scratch) / "network.onnx"

@@ -80,10 +80,10 @@ def choose_stop_threshold(present: ArrayLike, absent: ArrayLike) -> float | None
         absent: the log-odds of final observations.
 
     Returns:
-        The threshold with the fewest wrong decisions; None if `present` or `absent` is empty. It
-            lies a quarter of the way from the log-odds just below it to those just above it. If
-            several thresholds have equally few wrong decisions, it is the lowest, because an
-            unneeded action does less harm than a forgotten object.
+        The threshold with the fewest wrong decisions; None if `present` or `absent` is empty. Of
+            equally good thresholds it is the lowest, because an unneeded action does less harm than
+            a forgotten object. A threshold between two neighbouring log-odds lies a quarter of the
+            way from the lower to the higher one.
     """
     present, absent = np.sort(np.asarray(present, float)), np.sort(np.asarray(absent, float))
     if not len(present) or not len(absent):

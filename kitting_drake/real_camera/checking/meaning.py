@@ -28,9 +28,9 @@ _CLEAN = 0.0005
 _NOISY = 0.0016
 """The noise, in metres, above which details of 3 mm are lost."""
 _LOST = 1.8
-"""The height below which details are lost, as a multiple of the noise. It is two standard
-deviations of the filtered noise, which is nine tenths of the original noise if neighbouring pixels
-are correlated."""
+"""The height below which details are lost, as a multiple of the noise: two standard deviations of
+the filtered noise. If neighbouring pixels are correlated, filtering leaves nine tenths of the
+noise."""
 _FEW_HOLES, _MANY_HOLES = 0.02, 0.10
 
 

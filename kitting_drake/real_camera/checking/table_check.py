@@ -40,14 +40,13 @@ _FARTHEST = 0.35
 _LEAST = 150
 """The least number of used pixels on a plane."""
 _BELOW = 0.5
-"""To be the table, the plane at the calibrated height needs at least this fraction of the pixels of
-the largest plane below it."""
+"""The plane at the calibrated height is not the table if a plane below has more than 1 / `_BELOW`
+times as many pixels."""
 _ABOVE = 0.08
-"""The same for the largest plane above it. The fraction is small, because objects may hide most of
-a table."""
+"""The same for a plane above it. `_ABOVE` is small, because objects may hide most of a table."""
 _CURVED = 0.5
-"""The depths are converted as if they were distances from the camera. If this reduces the table's
-noise to less than this fraction, they probably are distances."""
+"""The depths are probably distances from the camera if conversion from distances to depths reduces
+the table's noise to less than this fraction."""
 _FLAT = 0.0005
 """The noise below which a table counts as flat, in metres."""
 

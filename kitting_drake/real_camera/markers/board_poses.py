@@ -32,8 +32,8 @@ _LIKELY = 0.2
 _NOISE = 0.05
 """`BoardFit.focal_error` assumes an error of the corners of at least this, in pixels."""
 _WORST = 3.0
-"""The error of corners, in pixels, above which the lens is probably another one, or the board
-moved."""
+"""If the error of the corners exceeds this, in pixels, the intrinsics are probably of another lens,
+or the board moved."""
 
 
 @dataclass(frozen=True)

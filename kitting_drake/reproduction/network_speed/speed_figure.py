@@ -86,7 +86,7 @@ def draw_networks(measured: dict[str, Any], path: Path) -> None:
 
 
 def _conditions(measured: dict[str, Any]) -> str:
-    """Describes in words the machine and the type of the numbers."""
+    """Describes the machine and the type of the numbers in words."""
     machine = measured["machine"]
     place = machine["cpu"] if machine["device"] == "cpu" else machine["device"]
     threads = f"{machine['threads']} thread{'s' if machine['threads'] > 1 else ''}"
@@ -123,7 +123,8 @@ def _draw_lines(
         for row in {id(row): row for row in chosen[:1] + chosen[-1:]}.values():
             _label(axis, row, measured, counts, quantity, text)
     low, high = axis.get_ylim()
-    # Make room for the labels: show at least two decades, and a quarter more at each end.
+    # Make room for the labels: extend each end by a quarter of the range, or by half a decade if
+    # that is more.
     spread = max(high / low, 100.0) ** 0.25
     axis.set_ylim(low / spread, high * spread)
     axis.yaxis.set_major_locator(LogLocator(numticks=6))

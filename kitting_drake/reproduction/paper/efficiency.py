@@ -14,7 +14,7 @@ from kitting_drake.reproduction.page.prose import prose
 from kitting_drake.reproduction.page.runs import LEARNED, METHODS
 
 EFFICIENCY = "networks.json"
-"""The file beside the results that is a copy of the output of `benchmark networks`."""
+"""A copy of the output of `benchmark networks`, beside the results."""
 
 
 def read_efficiency(folder: Path) -> dict[str, Any] | None:

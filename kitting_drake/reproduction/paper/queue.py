@@ -303,7 +303,7 @@ def _end(process: subprocess.Popen[str]) -> None:
 
 
 def run_paper(queue: Queue, cells: Sequence[Cell]) -> dict[str, str]:
-    """Fills cells with `Queue.run`. If a signal stops it, the running command ends too.
+    """Fills cells with `Queue.run`. If a signal stops the queue, the running command ends too.
 
     Returns:
         The reason for each cell that could not be filled, by name.

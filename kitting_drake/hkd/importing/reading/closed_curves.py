@@ -41,8 +41,8 @@ _PAGE = 0.85
 """A rectangle counts as the page if each of its sides is `_PAGE` to 1 / `_PAGE` times as long as
 the page's side."""
 _HOLE, _TOOL = 0.25, 0.4
-"""Shares of a rectangle's length. A curve in the rectangle that is shorter than `_HOLE` is a hole,
-and a curve that is longer than `_TOOL` may be a tool."""
+"""Shares of a rectangle's length. Within the rectangle, a curve shorter than `_HOLE` is a hole, and
+a curve longer than `_TOOL` may be a tool."""
 _ROUND = 0.02
 """The largest relative difference of a round curve's extents and area from those of a circle."""
 

@@ -231,8 +231,8 @@ def segment(observation: Observation) -> Segmentation:
         objects=tuple(
             item
             for item in _regions(loose, relief, resolution, areas.object)
-            # Filling in unseen pixels around a few wrong depths, in the shadow of a block, can
-            # create a region that looks like an object. Ignore such regions.
+            # Ignore regions of mostly unseen pixels: in the shadow of a block, a few wrong depths
+            # can make the filled-in heights look like an object.
             if observation.valid[item.mask].mean() > _OBJECT_SEEN
             and not _is_corner(item, fixture, float(relief[fixture].max(initial=0)), resolution)
         ),
@@ -266,8 +266,8 @@ def _inner_radius(mask: Mask) -> float:
 def _noise_of(
     height: NDArray[np.float32], relief: NDArray[np.float32], fixtures: list[Fixture]
 ) -> float:
-    """Returns the largest of the standard deviations of the noise of the table and of each
-    fixture's top, in metres.
+    """Returns the standard deviation of the noise, in metres: the largest of those on the table and
+    on each fixture's top.
 
     The table's noise alone may be underestimated, because heights below the grid are clipped.
     """

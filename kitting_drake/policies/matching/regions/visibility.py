@@ -75,8 +75,8 @@ class Visibility:
         return pickable
 
     def picks_are_seen(self, pixels: Array, thetas: Array, open_width: float) -> Mask:
-        """Returns whether, for each of n picks, enough is seen of its surroundings and of the area
-        that the jaws sweep.
+        """Returns, for each of n picks, whether its surroundings and the area that the jaws sweep
+        are seen well enough.
 
         Args:
             pixels: (n, 2) row and column of each pick.
@@ -102,7 +102,7 @@ class Visibility:
     def place_is_seen(
         self, footprint: Array | None, pick: Array, rotation: float, place: Array
     ) -> bool:
-        """Whether enough is seen of the area in which an object will lie, and of its surroundings.
+        """Whether the area in which an object will lie and its surroundings are seen well enough.
 
         Args:
             footprint: (n, 2), the object's pixels before the pick; None if they are unknown.
