@@ -19,7 +19,7 @@ from systems.path_timing import TICK, RowLimits, SmoothMotion, plan_motion
 from systems.vector_view import Array, Number, VectorView
 
 _LINE_POINTS = 17
-"""Number of points of a straight line of the hand at which the joint positions are computed."""
+"""Number of points, along a straight line of the hand, at which joint positions are computed."""
 _SPACING = 0.010
 """Spacing of a path's points, in s: the time that the slowest joint takes from one to the next at
 full speed."""

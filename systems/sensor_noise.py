@@ -47,7 +47,7 @@ class SensorNoiseParameters:
     # Quantization step of the depth at 1 m, in m. It grows with the square of the depth.
     depth_step: float = bounded(0.0, 0.0, 0.1)
 
-    # Share of the pixels beside an edge that get a depth between its two sides.
+    # Share of the pixels beside an edge that get a depth between those of the edge's two sides.
     flying_share: float = bounded(0.0, 0.0, 1.0)
 
     # Share of the pixels that are holes, which have no depth.
@@ -114,7 +114,7 @@ class SensorNoise(LeafSystem):
     - Depth z gets noise of standard deviation `depth_std (z / 1 m)^2`, smoothed over `correlation`
       pixels at constant variance, and is rounded to multiples of `depth_step (z / 1 m)^2`.
     - Beside an edge (a step of more than 15 mm between neighbours), a share `flying_share` of the
-      pixels gets a depth between the two sides.
+      pixels gets a depth between those of the two sides.
     - Holes get depth 0, which Drake's cameras return for objects that are too close. Blobs of holes
       cover the share `hole_share` of the image. If `label_image` is connected, they cover p percent
       of each surface with the label SHEEN_LABELS + p. Pixels that see a surface at more than

@@ -21,9 +21,9 @@ _PLACE_CLEARANCE_REACH = 0.125
 _SUPPORT_REACH = 0.08
 """Radius around the pick that is searched for the object's support, in metres."""
 _SUPPORT_SHARE = 10.0
-"""Percentile of the heights around a pick that is taken as the support's height."""
+"""The support's height is estimated by this percentile of the heights around the pick."""
 _TABLE_SHARE = 5.0
-"""Percentile of all heights that is taken as the table's height."""
+"""The table's height is estimated by this percentile of all heights."""
 _CLEAN = 0.0003
 """A standard deviation below this, in metres, counts as no noise."""
 _LEAST_FLAT = 500
@@ -34,12 +34,11 @@ average."""
 _FLAT = 0.012
 """Squares whose heights range over more than this, in metres, contain edges and are not flat."""
 _NOISY_RIM_SHARE, _NOISY_RIM_BIAS = 90.0, 1.0
-"""The rim's height is estimated by this percentile of the heights around a place. The second number
-is the bias of this estimate, in standard deviations of the noise. About two thirds of the heights
-belong to the rim."""
+"""With noise, the rim's height is estimated by a percentile of the heights around the place, about
+two thirds of which belong to the rim. The numbers are this percentile, and the estimate's bias in
+standard deviations of the noise."""
 _NOISY_FLOOR_SHARE, _NOISY_FLOOR_BIAS = 25.0, -0.67
-"""The floor's height is estimated by this percentile of the heights at a place. The second number
-is the bias of this estimate, in standard deviations of the noise."""
+"""The same for the floor's height, by a percentile of the heights at the place."""
 _SUNK = 0.003
 """A table that looks lower than expected by more than this, in metres, is assumed to be lower."""
 _TILT_DOUBT, _MOST_DOUBT = 0.3, 0.0025

@@ -18,7 +18,7 @@ FINGERS = 2
 class FingerLaw:
     """Computes the force of each finger's drive.
 
-    With the opening w = q_L + q_R (closed at zero), the desired one w_d and the closing force f,
+    For the opening w = q_L + q_R (zero if closed), the desired opening w_d and the closing force f,
 
         u_finger = clip(k_w (w_d - w)/2 + d_w (w_d' - w')/2 - f, -f_max, f_max).
 
