@@ -42,7 +42,7 @@ def cluster() -> Iterator[Any]:
 
 @pytest.fixture
 def start(tmp_path: Path) -> Callable[..., subprocess.Popen[bytes]]:
-    """Starts a command on a scenario in another process, which has the imported tool."""
+    """Starts a command on a scenario, in another process that can use the imported tool."""
     for place in (tmp_path / "imported" / "mine", tmp_path / "beside"):
         shutil.copytree(MODELS / "tools" / "combination_wrench", place)
 

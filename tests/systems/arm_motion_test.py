@@ -66,7 +66,7 @@ def check_limits(limits: ArmLimits, samples: NDArray, inertia: ArmInertia) -> No
     torques = np.einsum("nij,nj->ni", torques, a)
     assert (np.abs(torques) <= limits.torque).all()
     assert (np.abs(np.diff(torques, axis=0)) / 1e-3 <= limits.torque_rate).all()
-    # Differences may deviate from derivatives by what the jerk can change between two samples.
+    # Allow for the jerk between two samples, which makes differences deviate from derivatives.
     allowed = 1e-3 * np.array(limits.jerk) * 1e-3 / 2
     assert (np.abs(np.diff(v, axis=0) / 1e-3 - a[:-1]) <= 1e-3 * np.array(limits.jerk)).all()
     assert (np.abs(np.diff(q, axis=0) / 1e-3 - (v[:-1] + v[1:]) / 2) <= allowed).all()

@@ -158,7 +158,7 @@ def test_heightmap_shows_the_box_at_its_true_pose(scene, xy, yaw_deg):
         assert np.quantile(np.abs(hue - color / color.sum()), 0.999) < 0.01
         assert 0.5 < seen.max() / color.max() <= 1.01
 
-    # Of the surfaces that are fully visible to a camera, at most one pixel is blank.
+    # At most one of the pixels that a camera sees completely is blank.
     squares = PIXELS[:, :, None] + CORNERS
     visible = np.zeros(GRID.shape, bool)
     for camera in CAMERAS:

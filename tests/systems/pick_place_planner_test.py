@@ -800,7 +800,7 @@ def test_the_guard_lets_a_smaller_force_pass(force: tuple):
 
 
 def test_a_load_pressed_at_the_end_of_a_carry_is_no_payload():
-    """An object that touches too early is released there, and not pressed down further."""
+    """An object that touches something too early is released at once, not pressed down further."""
     touched = HANGING + GUARDED.hover_clearance + 0.002
     run = Run(World(touch_place=touched, stiffness=SOFT), parameters=GUARDED).until(Mode.RELEASE)
     assert run.output("desired_motion")[2] == pytest.approx(touched - 0.002, abs=1e-3)

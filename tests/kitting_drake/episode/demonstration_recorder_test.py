@@ -30,7 +30,7 @@ SMALL = {
     for name, camera in Scenario().cameras.items()
     if isinstance(camera, Pinhole)
 }
-# The tools still settle on the table, so observations differ between steps.
+# After so short a wait the tools are still settling, so observations differ between steps.
 HASTY = PickPlaceParameters(observe_settle=0.02)
 
 

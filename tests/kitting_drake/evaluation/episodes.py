@@ -76,7 +76,7 @@ def make_result(seed: int, objects: list[ObjectResult], **fields: Any) -> Episod
 
 
 def make_episode(seed: int, errors_mm: list[float], **fields: Any) -> dict[str, Any]:
-    """An episode as JSON values. It has an object for each error, all of different categories."""
+    """An episode as JSON values. Its objects have the given errors, and differ in category."""
     names = CATEGORIES[: len(errors_mm)]
     objects = [make_object(name, error) for name, error in zip(names, errors_mm, strict=True)]
     return make_result(seed, objects, **fields).as_dict()

@@ -43,7 +43,7 @@ def linear(shape: tuple[int, ...], label: tuple[float, ...]) -> Tensor:
 
 
 def rotated(vector: tuple[float, float] | NDArray[np.float64], angle: float) -> NDArray[np.float64]:
-    """A (row, col) vector rotated counter-clockwise about world +z; rows run along x, cols y."""
+    """A (row, col) vector rotated counter-clockwise about world +z. Row is along x, col along y."""
     row, col = vector
     cos, sin = math.cos(angle), math.sin(angle)
     return np.array([cos * row - sin * col, sin * row + cos * col])

@@ -1,4 +1,4 @@
-"""Frames from every kind of file are read as the tool that wrote the file means them."""
+"""Frames are read from every kind of file, by the conventions of the tool that writes it."""
 
 import base64
 import dataclasses

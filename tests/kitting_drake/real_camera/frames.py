@@ -71,9 +71,12 @@ def write_frames(folder: Path, frames: dict[str, Frame], depth: str = "npy") -> 
 def difference(one: PickPlaceAction, other: PickPlaceAction) -> NDArray[np.float64]:
     """How two actions differ, as an array (3,).
 
-    It holds the distance between the picks (mm), the distance between the places to which they
-    bring the second action's picked point (mm), and the difference between the rotations of the
-    object (degrees). The last two are zero if different grasps move an object alike.
+    - The distance between the picks, in mm.
+    - Both actions move the object's point at the second pick: the distance between the two places
+      to which it goes, in mm.
+    - The difference between the object's rotations, in degrees.
+
+    The last two are zero if different grasps move an object alike.
     """
     turned, other_turned = (item.place.theta - item.pick.theta for item in (one, other))
     c, s = math.cos(turned), math.sin(turned)

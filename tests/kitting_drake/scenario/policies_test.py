@@ -67,7 +67,7 @@ def test_learned_makes_the_configured_policy(
     config = Learned(weights_file.name, orientations=orientations, continuous=continuous)
     found = action(config, site, observation())
     networks = load_networks(weights_file, preferred_type())
-    # Without `continuous`, no stage refines the networks' actions; they may only stop.
+    # Without `continuous`, the only stage is the one that may stop; none refines an action.
     stages = make_stages(site.planner, insertion=True) if continuous else [StopRule()]
     policy = LearnedPolicy(networks, orientations=orientations, stages=stages)
     assert found == policy(observation())

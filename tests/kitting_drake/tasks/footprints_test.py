@@ -13,7 +13,7 @@ def test_separation_is_the_gap_between_polygons():
     square = rectangle(0.02, 0.02)
     assert separation(square, rectangle(0.04, 0.02, x=0.05)) == pytest.approx(0.02)
     assert separation(square, rectangle(0.02, 0.02, x=0.015)) == pytest.approx(-0.005)
-    # The diamond's corner points at a side of the square.
+    # A corner of the diamond is opposite a side of the square.
     diamond = rectangle(0.02, 0.02, x=0.03, theta=math.pi / 4)
     assert separation(square, diamond) == pytest.approx(0.02 - 0.01 * math.sqrt(2))
     # Two corners that face each other are 14 mm apart, but their separation is only 10 mm.

@@ -66,7 +66,7 @@ def test_a_recess_of_another_shape_costs_more():
 
 
 def bar(middle: tuple[float, float], angle: float, grown: float = 0.0) -> np.ndarray:
-    """The mask of a bar with one wider end, whose sides are moved outwards by `grown` pixels."""
+    """The mask of a bar that is wider at one end; its sides are moved out by `grown` pixels."""
     rows, cols = np.indices(SHAPE)
     u, v = np.moveaxis((np.stack([rows, cols], axis=-1) - middle) @ rotation_matrix(angle), -1, 0)
     return (np.abs(u) < 28 + grown) & (np.abs(v) < np.where(u > 18, 4.5, 3.5) + grown)

@@ -223,7 +223,7 @@ def test_poses_may_be_nested_as_in_ros(tmp_path: Path):
 
 
 def test_misplaced_and_misspelt_fields_are_rejected(tmp_path: Path):
-    """Ignoring them would be worse: this distortion beside `camera_info` would have no effect."""
+    """If they were ignored, a `distortion` beside `camera_info` would silently have no effect."""
     text = ROS.replace("camera_info:", "distortion: []\n    camera_info:")
     with pytest.raises(UserError, match="camera eye has the unknown field 'distortion'"):
         read(tmp_path, text, eye_info=CAMERA_INFO)

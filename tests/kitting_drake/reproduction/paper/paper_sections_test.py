@@ -30,7 +30,7 @@ CELLS = {cell.name: cell for cell in paper_cells()}
 
 
 def make_run(name: str, errors_mm: list[float]) -> Run:
-    """A run of a cell whose episodes all have these errors."""
+    """A run of a cell. In every episode, the objects have the given errors."""
     cell: Cell = CELLS[name]
     task = TASKS[cell.task]
     scenario = load_scenario(SCENARIOS / task.file, task.tested, cell.scenario_text("w"))

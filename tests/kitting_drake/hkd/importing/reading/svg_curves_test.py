@@ -77,7 +77,7 @@ def test_a_drawing_without_a_size_is_refused(root: str, tmp_path: Path):
 @pytest.mark.parametrize(
     ("root", "before", "sizes"),
     [
-        # A newer Inkscape saved a page of version 0.91; Illustrator saved a page of Inkscape.
+        # Inkscape 1.2 saved a page from Inkscape 0.91; Illustrator saved a page from Inkscape.
         (f'{INKSCAPE}"1.2" width="744.09" height="1052.36"', "", "278 mm, but .* 297 mm"),
         ('width="793.7" height="1122.52"', ILLUSTRATOR, "396 mm, but .* 297 mm"),
     ],

@@ -17,7 +17,7 @@ CAVITY = (slice(70, 74), slice(210, 260))
 @pytest.mark.parametrize("noise", [0.0, pytest.param(0.001, marks=pytest.mark.slow), 0.002])
 @pytest.mark.parametrize("height", [0.008, 0.02])
 def test_flat_objects_and_cavities_are_whole_in_noise(noise: float, height: float):
-    """Noise must not cut off a region's ends, which tell an object from its half turn."""
+    """Noise must not cut off a region's ends, which show which way round an object lies."""
     true = np.zeros(GRID.shape)
     true[50:130, 190:280] = 0.05
     true[FLAT], true[CAVITY] = height, 0.05 - height
