@@ -31,7 +31,7 @@ _FARTHEST_STOP = 0.02
 """The arm stops at a given pose or height only if the hand is at most this far from it, in m.
 Otherwise the arm brakes where it is."""
 _SAME_HEIGHT = 0.003
-"""The hand counts as having reached a height if it is at most this far below, in m."""
+"""A height counts as reached when the hand is at most this far below it, in m."""
 
 _HELD_REACH = 0.125
 """How far a held object reaches from the fingertips at most, in m. `read_surface_heights` assumes

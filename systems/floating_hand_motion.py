@@ -101,7 +101,7 @@ class HandMotion(JawMotion):
         self.set_times(state)
 
     def _set_goals(self, state: PlannerState, mode: Mode) -> None:
-        """Sets the goal of a mode, or leaves it where the braking hand comes to rest."""
+        """Sets the goal of a mode. Axes that the mode does not set keep the default goal."""
         parameters = self._parameters
         if mode == Mode.APPROACH:
             state.goal = (*state.pick[:2], state.pick_hover_z, state.pick[2])

@@ -111,10 +111,10 @@ class PickPlaceParameters:
     yaw_speed: float = bounded(2.5, 0.01, 2.5)
     yaw_acceleration: float = bounded(20.0, 0.1, 25.0)
 
-    # Highest speeds in DESCEND and LOWER, in m/s. `descend_speed` and `lower_speed` hold above all
-    # surfaces near the goal, `contact_speed` below them, where a contact is possible, and
-    # `touch_speed` where contact is expected. The force of an impact is proportional to the speed:
-    # about 10 N at 0.015 m/s.
+    # Highest speeds in DESCEND and LOWER, in m/s. `descend_speed` and `lower_speed` apply while the
+    # hand is higher than all surfaces near its goal. Lower down, where a contact is possible,
+    # `contact_speed` applies, and where a contact is expected, `touch_speed`. The force
+    # of an impact is proportional to the speed: about 10 N at 0.015 m/s.
     descend_speed: float = bounded(0.20, 0.005, 1.0)
     lower_speed: float = bounded(0.20, 0.005, 1.0)
     contact_speed: float = bounded(0.05, 0.005, 1.0)

@@ -237,8 +237,7 @@ class SurfaceHeights:
     doubt: float = 0.0
     """The uncertainty of differences between these heights; zero if o_t has no noise or tilt."""
     width: float = math.inf
-    """The width, in the direction in which the jaws close, that the open jaws must clear at the
-    pick; infinite if unknown."""
+    """How wide the jaws must open to clear the object at the pick; infinite if unknown."""
 
 
 STOP_REASONS = {

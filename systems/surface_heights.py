@@ -43,7 +43,7 @@ _SUNK = 0.003
 """A table that looks lower than expected by more than this, in metres, is assumed to be lower."""
 _TILT_DOUBT, _MOST_DOUBT = 0.3, 0.0025
 """The uncertainty of heights is the noise plus `_TILT_DOUBT` times the table's deviation before
-levelling, but at most `_MOST_DOUBT`, in metres."""
+levelling. This sum is limited to `_MOST_DOUBT`, in metres."""
 
 
 def read_surface_heights(

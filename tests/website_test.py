@@ -27,7 +27,7 @@ def test_the_modules_of_the_reference_exist():
 
 
 def test_an_empty_line_precedes_lists_in_comments():
-    # Without the line, Markdown makes the list part of the paragraph before it.
+    # Without the empty line, Markdown makes the list part of the paragraph before it.
     for path in reference().values():
         assert not re.search(r"^ +# \w.*\n +# - ", path.read_text(), re.MULTILINE), path
 

@@ -23,7 +23,7 @@ _UNCOMMITTED = "+"
 
 
 def versions() -> dict[str, str]:
-    """The versions of this package and its main dependencies; that of Drake only if Drake is
+    """The versions of this package and its main dependencies. Drake is left out if it is not
     installed."""
     found = {"kitting_drake": kitting_drake.__version__}
     with contextlib.suppress(importlib.metadata.PackageNotFoundError):

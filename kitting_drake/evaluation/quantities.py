@@ -6,7 +6,7 @@ from rich.table import Table
 
 
 def seconds_text(seconds: float | None) -> str:
-    """Formats a time in s or ms, rounded to three significant digits; from 100 s on, to seconds."""
+    """Formats a time: in whole seconds from 100 s on; otherwise in s or ms, with three digits."""
     if seconds is None:
         return "-"
     if seconds >= 100:

@@ -96,7 +96,7 @@ def certainty(decision: Decision, resolution: float) -> dict[str, float]:
     - `something_to_pick` (for a stop, `nothing_to_pick`): the predicted probability that there is
       something (or nothing) left to pick; missing if the networks have no stop class;
     - `pick`: the probability of the pixels within 1 cm of the pick, divided by that of the pixels
-      within 6 cm, which leaves other objects out; missing for a stop;
+      within 6 cm, so that other objects do not count; missing for a stop;
     - `angle`: the probability of the angles within 10 degrees of the chosen one; missing for a
       stop.
     """

@@ -72,6 +72,6 @@ def test_the_velocity_limits_of_an_fr3_depend_on_the_position():
     low, high = FR3.velocity_bounds(q)
     assert high[1] < 0.5
     assert low[1] == -2.62
-    # At the upper ends of their ranges, the joints may hardly move upwards.
+    # At the upper ends of the joints' ranges, the limits of upward velocities are small.
     assert np.abs(FR3.velocity_bounds(np.array(FR3.upper))[1]).max() < 0.2
     np.testing.assert_array_equal(PANDA.velocity_bounds(q)[1], PANDA.velocity)

@@ -62,7 +62,8 @@ def test_the_hand_is_where_the_action_says():
         it.mode: motion.postures.hand_pose(trajectory.positions[it.last])
         for it in trajectory.segments
     }
-    # The fingertips end 10 mm below the object's top at the pick, at the cavity's rim at the place.
+    # At the pick, the fingertips end 10 mm below the object's top. At the place, they end at the
+    # height of the cavity's rim.
     np.testing.assert_allclose(ends["DESCEND"][:3], [0.45, 0.2, 0.01], atol=1e-3)
     np.testing.assert_allclose(ends["LOWER"][:3], [0.55, -0.1, 0.05], atol=1e-3)
     turned = ends["LOWER"][3] - ends["DESCEND"][3]

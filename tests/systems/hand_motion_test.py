@@ -101,7 +101,7 @@ def test_shortest_yaws(pick, place, present, expected):
     if expected is not None:
         np.testing.assert_allclose(rotated, expected)
     assert max(map(abs, rotated)) <= limit
-    # The yaws give the same grasp and the same rotation of the object as the given ones.
+    # These yaws grasp and rotate the object in the same way as `pick` and `place`.
     half_turns = (rotated[0] - pick) / np.pi
     assert half_turns == pytest.approx(round(half_turns))
     turns = ((rotated[1] - rotated[0]) - (place - pick)) / (2 * np.pi)

@@ -33,8 +33,8 @@ class HeadEnd:
     kind: str = "bell"
     # The distance from the eye's middle to the end.
     reach_mm: float = 56.0
-    # The size at the end along x (for a face, its diameter), and the size along z (0: the same as
-    # along x).
+    # The extents of the end along x (for a face: the diameter) and along z (0: the same as along
+    # x).
     size_mm: float = 29.0
     thickness_mm: float = 0.0
     # The size of the neck behind a bell or a ball, or of the root of a claw, wedge or point.

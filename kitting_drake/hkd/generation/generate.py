@@ -65,7 +65,7 @@ class Report:
     description: dict[str, Any]
     triangles: int
     collision_hulls: int
-    # The largest distances of the collision outline outside and inside the visual outline.
+    # How far, at most, the collision outline lies outside and inside the visual outline.
     outside_mm: float
     inside_mm: float
     # The lowest point, the highest point and the gripped width of the collision geometry, minus

@@ -45,7 +45,7 @@ class Decomposition:
     hulls: list[np.ndarray]
     """The vertices (n, 3) of each hull, in mm."""
     outline_deviation_mm: float
-    """The largest distance between the outlines of the hulls and of the solid from above, in mm.
+    """The largest distance between the hulls' outline and the solid's, seen from above, in mm.
 
     Notches narrower than 4 mm are ignored, and distances above 5 mm count as 5. Infinity if there
     are no hulls.

@@ -23,16 +23,16 @@ NOMINAL_MM = 180.0
 
 # Vertices in the same cell of a grid with this spacing are merged.
 _MERGE_MM = 1e-3
-# Bodies that are farther apart than `_GAP_MM` are separate objects. If all objects but the largest
-# have together at most the share `_DIRT` of the volume, they are removed.
+# Bodies that are farther apart than `_GAP_MM` are separate objects. If the largest object has at
+# least the share 1 - `_DIRT` of the volume, the others are removed; if not, the mesh is rejected.
 _GAP_MM, _DIRT = 1.5, 0.02
 # The largest share of the area of a projection along x, y or z that a repair may lose.
 _LOST = 0.03
 # The size of a pixel of the compared projections.
 _PIXEL_MM = 0.5
-# If repair adds more than the share `_TELLING` of the surface, a note reports it. The repaired
-# surface is sampled at `_PROBES` points; a point counts as added if it is farther than `_AWAY_MM`
-# from the given surface.
+# A note warns if more than the share `_TELLING` of the repaired surface is new. This surface is
+# sampled at `_PROBES` points; a point counts as new if it is farther than `_AWAY_MM` from the given
+# surface.
 _TELLING, _AWAY_MM, _PROBES = 0.03, 1.5, 20_000
 _MOST_COMPONENTS = 3000
 _VOXEL_MM = 0.75

@@ -208,7 +208,7 @@ def contact_surfaces(cavities: Sequence[Cavity], parameters: KitParameters) -> d
 
     - each floor is one rectangle that extends into the solid, where nothing can touch it;
     - top and walls are cut into small pieces;
-    - large and small triangles are in separate meshes, because they would share large boxes.
+    - large and small triangles are in separate meshes; in one mesh they would share large boxes.
 
     Args:
         cavities: the block's cavities.

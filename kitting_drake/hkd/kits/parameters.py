@@ -14,8 +14,8 @@ _FINEST = 5e-6
 class KitParameters:
     """The parameters of a kit's block. Lengths in m."""
 
-    # The block's extents along x, y and z. If the tools are nested (packed closely), the block is
-    # as small as possible, and has this length and width only if `fixed_size` is set.
+    # The block's extents along x, y and z. If the tools are nested (packed closely), the length and
+    # width are used only with `fixed_size`; without it, the block is as small as possible.
     length: float = bounded(0.280, 0.04, 1.0)
     width: float = bounded(0.260, 0.04, 1.0)
     height: float = bounded(0.050, 0.01, 0.2)

@@ -17,11 +17,11 @@ _NO_SHADOW = 1.3
 _BALL_MM = 0.9
 """The radius of the disc that `_reached` rolls over the ground, in mm."""
 _ROUGH = 0.022
-"""A surface of at most this roughness, in logarithms of light, is always smooth for `MIDDLE`."""
+"""Every surface that is less rough than this, in logarithms of light, is smooth for `MIDDLE`."""
 _MOST_FINE = 0.1
 _HOLE_BALL_MM = 0.6
 _STRIP_MM = 1.2
-"""An eroded region in `_shaded_holes` counts as a strip if it is at most twice this wide, in mm."""
+"""An eroded region in `_shaded_holes` is a strip if it is at most twice this wide, in mm."""
 _EDGE_MM = 2.3
 """The distance by which the ground is extended over the rough pixels at an edge, in mm."""
 _SHINE_STEEP = 0.6
@@ -40,7 +40,7 @@ _GLARE_REACH_MM, _GLARE_GAP_MM, _GLARE_MM2, _GLARE_SHARE = 8.0, 2.5, 0.7, 0.25
 narrower than twice `_GLARE_GAP_MM`. An added region has an area of at least `_GLARE_MM2`, of which
 at least the share `_GLARE_SHARE` is brighter than the ground."""
 _BAY_MM = 12.0
-"""Bays and holes up to twice this wide, in mm, may be reflections."""
+"""Bays and holes may be reflections if they are at most twice this wide, in mm."""
 _BLENDED_MM, _SHADED = 1.2, 0.06
 """A tool blends into a shadow where the step of light is wider than `_BLENDED_MM` and the shadow is
 darker than `_SHADED`, in logarithms of light."""

@@ -79,7 +79,7 @@ class Origin:
     versions: dict[str, str]
     """Versions of the packages that made the latest demonstrations."""
     learning: Learning = field(default_factory=Learning)
-    """The assumptions that the task allows training to make."""
+    """What training may assume about the task."""
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,4 @@
-"""The assumptions that a task allows training to make. This module imports neither Drake nor
-torch."""
+"""What training may assume about a task. This module imports neither Drake nor torch."""
 
 from __future__ import annotations
 
@@ -8,9 +7,9 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Learning:
-    """Assumptions that a task allows training to make.
+    """What training may assume about a task.
 
-    By default there are none, as in the paper (section V-C.1).
+    By default it assumes nothing, as in the paper (section V-C.1).
     """
 
     later_picks_possible: bool = False

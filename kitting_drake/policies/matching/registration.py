@@ -164,8 +164,8 @@ def register(
         starts: initial rotations in radians and shifts in pixels. If there are none, the best of
             many rotations about the centroids are refined.
         within: whether `recess` is in fact the outline of several touching objects, and `outline`
-            that of one of them. Parts of `outline` then have no counterpart and get little weight,
-            and the offset is at most `_OFFSET_WITHIN`.
+            is the outline of one of them. Parts of `outline` then have no counterpart and get
+            little weight, and the offset is at most `_OFFSET_WITHIN`.
     """
     begins = starts or _coarse_starts(outline, recess)
     found = [_refine(outline, recess, rotation, shift, within) for rotation, shift in begins]
@@ -236,8 +236,8 @@ class FitQuality:
     """The standard deviation, in pixels, of the fitted positions of the object's points. It is
     computed as if the errors of the distances were independent."""
     rival: float
-    """The least coarse cost of a clearly different rotation, minus that of this rotation, in
-    metres. It is small for objects with rotational symmetry."""
+    """The coarse cost of the best clearly different rotation, minus the coarse cost of this
+    rotation, in metres. It is small for objects with rotational symmetry."""
     offset: float
     """How much smaller the recess is than the object on every side, in metres; negative if the
     recess is larger."""

@@ -2,7 +2,7 @@
 
 A symmetric object such as a cube can be placed in several rotations. The networks cannot choose
 among them, because their features do not encode how the jaws hold the object. The choice matters if
-other objects stand beside the place. This uses only heights and is not in the paper.
+other objects stand beside the place. This module uses only heights and is not in the paper.
 """
 
 from __future__ import annotations

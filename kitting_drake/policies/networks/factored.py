@@ -96,10 +96,11 @@ class Networks(nn.Module):
         self.config = config
         self.preset = PRESETS[config.preset]
         self.compute_type = torch.float32
-        """The floating-point type in which the networks compute, and of their inputs."""
+        """The floating-point type of the networks' inputs and computations."""
         self.rotations: int | None = None
-        """The number of crop rotations in a training step of the Transporter. Scene rotations are
-        half as many. None uses the default of `transporter.draw_bins`. Other methods ignore it."""
+        """The number of crop rotations in a training step of the Transporter. The number of scene
+        rotations is half of it. None uses the default of `transporter.draw_bins`. Other methods
+        ignore it."""
         self.stop_threshold: float | None = None
         """The log-odds below which a policy stops; None if it never stops. `validation.validate`
         chooses it, and it is stored with the weights."""

@@ -56,9 +56,9 @@ def export_onnx(weights: Path, folder: Path) -> list[Path]:
     """Writes the networks of a weights file as ONNX in float32, and `policy.json`.
 
     Each graph maps `image`, prepared as `policy.json` describes, to `output`. The U-nets alpha, phi
-    and psi take any sides that are one more than a multiple of 16 pixels; beta takes a crop with
-    sides of `PICK_CROP` pixels. The steps that make, rotate and correlate crops are not exported
-    (see docs/learning.md).
+    and psi take images whose sides are one more than a multiple of 16 pixels; beta takes a crop
+    with sides of `PICK_CROP` pixels. The steps that make, rotate and correlate crops are not
+    exported (see docs/learning.md).
 
     Args:
         weights: a file that `train` wrote.

@@ -192,7 +192,7 @@ class Trainer:
     def _draw(
         self, number: int, samples: Sequence[LabelledImage], finals: Sequence[Pictured]
     ) -> _Draw:
-        """Draws and augments a sample, and with one of eight samples also a final observation.
+        """Draws and augments a sample; for one sample in eight, also draws a final observation.
 
         Args:
             number: the number of the sample in the whole training.

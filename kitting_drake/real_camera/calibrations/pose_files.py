@@ -1,5 +1,4 @@
-"""Reads poses from files: of tf2_echo, hand-eye calibrations, MoveIt, Open3D, and plain
-matrices."""
+"""Reads poses that tf2_echo, hand-eye calibrations, MoveIt or Open3D wrote, and plain matrices."""
 
 from __future__ import annotations
 

@@ -31,8 +31,8 @@ _NOT_AN_IMAGE = (OSError, SyntaxError, ValueError, TypeError, Image.Decompressio
 
 @dataclass(frozen=True)
 class TableOutline:
-    """The parts of the workspace that are table, and those that are not, such as the robot's base
-    or the floor."""
+    """The part of the workspace where the table is. Other parts may be the robot's base or the
+    floor."""
 
     region: Polygon = ()
     """A polygon around the table; empty if there is none."""

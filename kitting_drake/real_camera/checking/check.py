@@ -45,8 +45,8 @@ class TableCheck:
     noise: float
     """A robust estimate of the standard deviation of the heights, in metres."""
     holes: float
-    """The share of the table without measured depth, from 0 to 1. For one camera only the part in
-    its view counts, for o_t the whole table."""
+    """The share without measured depth, from 0 to 1: for one camera, of the part of the table in
+    its view; for o_t, of the whole table."""
 
     @property
     def tilt_angle(self) -> float:

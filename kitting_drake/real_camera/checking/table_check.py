@@ -40,10 +40,10 @@ _FARTHEST = 0.35
 _LEAST = 150
 """The least number of used pixels on a plane."""
 _BELOW = 0.5
-"""The plane at the calibrated height is not the table if a plane below has more than 1 / `_BELOW`
-times as many pixels."""
+"""The plane at the calibrated height must have at least this fraction of the pixels of any plane
+below it. Otherwise the plane with the most pixels counts as the table."""
 _ABOVE = 0.08
-"""The same for a plane above it. `_ABOVE` is small, because objects may hide most of a table."""
+"""The same fraction for planes above it. It is small, because objects may hide most of a table."""
 _CURVED = 0.5
 """The depths are probably distances from the camera if conversion from distances to depths reduces
 the table's noise to less than this fraction."""
@@ -213,8 +213,7 @@ def _hint(
 def _suppositions(
     camera: BenchCamera, depth: NDArray[np.float32]
 ) -> Iterator[tuple[str, BenchCamera, Array, NDArray[np.float32]]]:
-    """Yields, for each frequent mistake, a hint, and the camera, pose and depth without the
-    mistake."""
+    """Yields (hint, camera, pose, depth) for each frequent mistake, with the mistake corrected."""
     X = camera.X_BC
     yield (
         "these depths are distances from the camera: give depths along the optical axis",

@@ -91,9 +91,9 @@ def make_views(frames: Mapping[str, Frame], calibration: Calibration) -> list[Vi
 def table_depth(
     camera: BenchCamera, calibration: Calibration, step: int = 1
 ) -> NDArray[np.float64]:
-    """Returns the table's depth (height, width) in metres that the camera's pose predicts.
+    """Predicts the table's depth from the camera's pose. Returns (height, width) depths in metres.
 
-    It is NaN for pixels that do not look at the workspace's table. Only every `step`th row and
+    A depth is NaN for pixels that do not look at the workspace's table. Only every `step`th row and
     column is computed.
     """
     X_BC, grid = camera.X_BC, calibration.grid

@@ -33,8 +33,8 @@ _ALIGNED = re.compile(r"aligned_depth_to_color|depth_registered|depth_to_rgb|reg
 _COLOUR = re.compile(r"colou?r|rgb")
 _REALSENSE = re.compile(r"/device_\d+/sensor_\d+/")
 _DIFFERENT = 0.02
-"""The largest difference between the intrinsics of the calibration and a CameraInfo, as a fraction
-of the focal length or the width. If it is larger, they belong to two lenses."""
+"""If the intrinsics in the calibration and in a CameraInfo differ by more than this fraction of the
+focal length or the width, they belong to two lenses."""
 _UNITS = "std_msgs/msg/Float32"
 
 

@@ -130,8 +130,8 @@ def _record(calibrated: Calibrated) -> dict[str, Any]:
 def _draw(result: CalibratedCamera, camera: BenchCamera, calibrated: Calibrated) -> bytes:
     """Draws the first image as a PNG.
 
-    Circles mark the detected corners, crosses the corners predicted by the pose. The board's axes
-    are drawn as well.
+    Circles mark the detected corners; crosses mark the corners that the pose predicts. The board's
+    axes are drawn as well.
     """
     lens = camera.intrinsics if camera.color is None else camera.color.intrinsics
     X = result.fit.X_KM

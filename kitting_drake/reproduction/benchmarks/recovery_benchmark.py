@@ -235,8 +235,8 @@ def benchmark_recovery(
         console: the console for the progress.
 
     Returns:
-        The counts, and a PNG with the frames of one episode for each disturbance. Among the
-            episodes in which all objects were placed, it is the one with the most actions.
+        The counts, and a PNG with the frames of one episode for each disturbance: the episode with
+            the most actions among those in which all objects were placed.
 
     Raises:
         UserError: the scenario has no cameras for the frames, or the scene of a seed cannot be

@@ -34,7 +34,7 @@ def benchmark_simulation(episodes: int, seed: int, console: Console) -> dict[str
     """Runs all measurements of `benchmark simulation`.
 
     Args:
-        episodes: the number of episodes for the oracle, and the same number for the learned policy.
+        episodes: the number of episodes for each of two policies, the oracle and a learned policy.
         seed: the first of the successive seeds.
         console: the console for the progress.
     """

@@ -25,7 +25,7 @@ Summary = dict[str, Any]
 TABLE = "runs.csv"
 EPISODES = "episodes.jsonl.xz"
 _NAME = "run"
-"""The column of the table, and the field of a line, that has the name of the run."""
+"""The key of a run's name: a column of the table, and a field of each line of `EPISODES`."""
 _LONG = ("categories", "outcomes", "resolved_scenario")
 """The fields that are in `EPISODES` instead of the table."""
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _COLOURS = {10: "#009e73", 100: "#d55e00"}
-"""Green and orange, as in the paper, which the colour-blind can distinguish."""
+"""Green and orange as in the paper, in shades that the colour-blind can distinguish."""
 _MARKERS = {"so2": "o", "equivariant_transporter": "s", "transporter": "^"}
 _STEP = 0.12
 """The distance between neighbouring markers of one N. Successive N are at a distance of 1."""

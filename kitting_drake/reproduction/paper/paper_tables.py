@@ -135,7 +135,8 @@ def _headline_seeds() -> list[Cell]:
 
 
 def _ablation() -> list[Cell]:
-    """Returns cells with all our extensions, with recovery in addition, or with some left out."""
+    """Returns cells with our extensions, cells that also have recovery, and cells that lack one
+    extension."""
 
     def ours(task: str, label: str, **changes: Any) -> Cell:
         kept = ("taken_only", "rigid")

@@ -112,7 +112,7 @@ class _DrawnKitting(KittingTask):
     # Least distance between any two of the tools and kits, in m.
     spacing: float = bounded(0.008, 0.0, 0.2)
 
-    # Tools and kit are rotated by random angles between minus and plus this, in degrees.
+    # Tools and kit are rotated by random angles of at most this to either side, in degrees.
     yaw_range_deg: float = bounded(180.0, 0.0, 180.0)
 
     # Whether the oracle takes the tools in random order. If not, it takes them in the listed order.

@@ -47,7 +47,7 @@ class _Room:
     grid: PixelGrid
     spacing: float
     yaw_range: float
-    """Rotations are between minus and plus this, in rad."""
+    """The largest rotation to either side, in rad."""
 
     @property
     def outline(self) -> CrossSection:

@@ -167,7 +167,7 @@ def test_stops_when_the_log_odds_are_below_the_threshold(
     assert policy.log_odds(observation()) == log_odds
     found = policy.decide(observation())
     assert (found.stop, found.log_odds) == (stop, log_odds)
-    # Even if it stops, the decision holds the action that the policy would have taken.
+    # Even if the policy stops, the decision holds the action that the policy would have taken.
     np.testing.assert_allclose(
         found.place_pixel, GOAL + rotated((0.3, 0.4), ROTATION * BIN), atol=0.1
     )

@@ -33,7 +33,7 @@ _LOWEST = 5.0
 _MARGIN = LEAST_WALL + 0.6
 """The least material around a dovetail, in mm."""
 _STEP = 1.5
-"""The distance between the places along a cut that are tried, in mm."""
+"""Along a cut, a dovetail is tried at positions that are this far apart, in mm."""
 _ROOT = 1.0
 """The length by which a dovetail overlaps its own piece, in mm."""
 

@@ -7,7 +7,7 @@ import numpy as np
 from manifold3d import CrossSection
 from PIL import Image, ImageDraw, ImageFont
 
-# The picture is drawn `_FINER` times as large, and then reduced to smooth its edges.
+# The picture is drawn `_FINER` times as large and then scaled down, which smooths its edges.
 _LENGTH_PX, _MARGIN_PX, _FINER = 1000, 60, 2
 _TOOL, _GROUND, _TEXT = (70, 90, 120), (255, 255, 255), (30, 30, 30)
 

@@ -50,7 +50,7 @@ _RECESS_SEEN = 0.3
 _GAP = 1.5
 """The gap between an object and its recess is at most twice this wide, in pixels."""
 _LEAST_GAP = 0.003
-"""The same limit in metres. The larger of the two limits applies."""
+"""The same limit in metres. The larger of `_GAP` and `_LEAST_GAP` applies."""
 _FLAT = 0.0006
 """The largest deviation, in metres, from a flat floor's median depth. Twice the noise is used
 instead if that is more."""

@@ -16,7 +16,8 @@ _COLOURS = ("#d55e00", "#cc79a7", "#e69f00", "#8c6d1f", "#56b4e9", "#009e73", "#
 _MARKERS = "ov^sDPX*"
 _LINE = "#0072b2"
 _SHOWN = 0.995
-"""The share of cycles on the histogram's axis. Longer cycles are counted in its last bar."""
+"""The histogram's axis ends just beyond this quantile of the cycle times. Its last bar counts all
+longer cycles."""
 
 
 def endurance_table(measured: dict[str, Any]) -> Table:

@@ -490,7 +490,7 @@ def test_numbers_out_of_range(options: dict, tmp_path: Path):
 def test_the_child_process_has_a_limit_of_time(tmp_path: Path):
     path = exported(mallet(), tmp_path / "mallet.stl")
     with pytest.raises(UserError, match="s of processor time and was stopped while"):
-        # A limit is raised to at least 1 s. Starting the process takes longer.
+        # The limit becomes the minimum, 1 s. Starting the process alone takes longer.
         import_tool(ImportRequest(path, "hammer", output=tmp_path / "tools"), time_limit=-9.0)
     assert not (tmp_path / "tools").exists()
 

@@ -43,7 +43,7 @@ def test_is_made_by_its_name():
 
 @pytest.mark.parametrize("name", ["alpha", "phi", "psi"])
 def test_encodings_are_equivariant_to_rotations_by_180_degrees(name: str):
-    # Apart from 0, 180 degrees is the only rotation of C_6 that needs no interpolation on a grid.
+    # Of the rotations of C_6, only those by 0 and 180 degrees need no interpolation on a grid.
     network = getattr(make_networks(TINY), name)
     image = torch.randn(1, 4, 33, 49)
     assert_near(network(image.rot90(2, (2, 3))), network(image).rot90(2, (2, 3)))

@@ -49,8 +49,8 @@ def shared_cell(kind: type[TaskConfig], seed: int) -> Rig:
 class Posed:
     """A scene in which a test poses the objects and the hand.
 
-    Objects float a little above their supports, and upper ones higher, so that resting objects do
-    not touch each other. Every contact is therefore an error.
+    Every object is raised a little, higher objects more, so that no object touches its support.
+    Every contact is therefore an error.
     """
 
     def __init__(self, kind: type[TaskConfig], seed: int) -> None:

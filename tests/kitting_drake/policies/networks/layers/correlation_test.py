@@ -175,8 +175,8 @@ def test_of_windows_with_the_same_maximum_the_one_with_more_neighbours_is_kept()
     volume = torch.zeros(72, 20, 20)
     volume[70, 9, 9], volume[30, 2, 2] = 3.0, 5.0
     cut = Candidate(torch.cat([volume[66:], volume[:3]])[:, 1:10, 3:12], 66, (1, 3))
-    # This window has the same maximum as `cut`, but with all its neighbours. Its bins are named a
-    # full turn lower, and its values differ by rounding.
+    # This window has the same maximum as `cut`, but with all its neighbours. Its bins are
+    # numbered from -6 instead of 66, and its values differ as if by rounding.
     whole = Candidate(volume[66:72, 5:14, 5:14] * (1 - 1e-6), 66 - 72, (5, 5))
     other = Candidate(volume[28:33, 0:7, 0:7], 28, (0, 0))
     for given in itertools.permutations([cut, whole, other]):
