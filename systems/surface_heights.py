@@ -49,7 +49,7 @@ levelling. This sum is limited to `_MOST_DOUBT`, in metres."""
 def read_surface_heights(
     observation: Observation, pick: PlanarPose, place: PlanarPose
 ) -> SurfaceHeights:
-    """Reads the surface heights around a pick and a place off o_t.
+    """Reads from o_t the surface heights around a pick and a place.
 
     - Unseen pixels are filled in (`fill_unseen`).
     - An object's support is a low percentile of the heights around it. An object in the middle of
@@ -147,7 +147,7 @@ def _noise(height: NDArray[np.float32]) -> float:
 
 
 def _around(values: NDArray[Any], pixel: NDArray[np.float64], reach: int) -> NDArray[Any]:
-    """The values (rows, cols) in a square of `reach` pixels around a position (row, col)."""
+    """The values (rows, cols) at most `reach` rows and columns away from a position (row, col)."""
     row, col = np.rint(pixel).astype(int)
     rows = slice(max(row - reach, 0), max(row + reach + 1, 0))
     cols = slice(max(col - reach, 0), max(col + reach + 1, 0))

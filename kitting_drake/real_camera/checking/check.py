@@ -80,8 +80,8 @@ class Check:
     """For each pair of cameras, how much higher the first camera sees the table than the second, in
     metres."""
     block_shifts: dict[tuple[str, str], Array]
-    """For each pair of cameras, the block's position (2,) as the first camera sees it minus that as
-    the second sees it, in metres."""
+    """For each pair of cameras, the position (2,) of the block as seen by the first camera, minus
+    the position as seen by the second, in metres."""
     block: Block | None
     corrected: Calibration
     heights: dict[str, NDArray[np.float32]]
