@@ -1,13 +1,11 @@
 """The station: a Diagram of the whole robot cell, without the policy."""
 
-import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.geometry import CollisionFilterDeclaration, GeometrySet
 from pydrake.math import RigidTransform
 from pydrake.multibody.tree import BodyIndex, RigidBody
 from pydrake.systems.analysis import Simulator
@@ -18,15 +16,14 @@ from kitting_drake.common.rendering import X_WARM_OVERVIEW, X_WOVERVIEW, can_ren
 from kitting_drake.scenario.robots import FrankaArm
 from kitting_drake.scenario.schema import Scenario
 from kitting_drake.station.control import add_control
+from kitting_drake.station.free_bodies import FreeBodies
 from kitting_drake.station.held_bodies import ArmPath
-from kitting_drake.station.mass_centres import correct_drift
 from kitting_drake.station.paint import paint_surfaces
 from kitting_drake.station.plant import add_models, add_plant, bounded_body, set_initial_poses
 from kitting_drake.station.robot import (
     add_robot,
     arm_model,
     make_motion,
-    robot_state,
     set_home,
 )
 from kitting_drake.station.scene_reach import check_scene_reach
@@ -34,7 +31,7 @@ from kitting_drake.station.sensing import add_cameras
 from kitting_drake.tasks.task import TABLE, Scene
 from systems.object_feeder import ObjectFeeder
 from systems.pick_place_parameters import Mode
-from systems.placement import GONE, PlacedObject, Placement
+from systems.placement import PlacedObject, Placement
 from systems.placement_monitor import PlacementMonitor
 from systems.rest_detector import RestDetector
 from systems.signals import Attempt, Observation, PickPlaceAction
@@ -314,99 +311,36 @@ class KittingStation(Diagram):
                 "the station is part of a Diagram: pass the outermost Diagram to make_simulator"
             )
         simulator = Simulator(self if diagram is None else diagram)
-        bodies = self._bodies
+        bodies = self._free_bodies()
 
         def step(root_context: Context) -> EventStatus:
-            self._let_appear(root_context)
-            self._apply_sleep(root_context, bodies)
+            bodies.let_appear(root_context)
+            bodies.apply_sleep(root_context, self.at_rest(root_context))
             status = EventStatus.DidNothing() if monitor is None else monitor(root_context)
             # Correct the drift last, so that the monitor sees the bodies where the planner's update
             # saw them.
-            self._correct_drift(root_context, bodies)
+            bodies.correct_drift(root_context)
             return status
 
         simulator.set_monitor(step)
         return simulator
 
-    # The simulator's monitor calls the next three methods, because a LeafSystem cannot change the
-    # context of another system.
-
-    def _correct_drift(self, root_context: Context, bodies: Sequence[RigidBody]) -> None:
-        """Calls `correct_drift` if the plant has just made a step."""
-        step = self.plant.time_step()
-        # Allow for rounding errors in the times of steps, which are exact only if the step is a
-        # binary fraction.
-        if abs(math.remainder(root_context.get_time(), step)) < 1e-6 * step:
-            context = self.plant.GetMyMutableContextFromRoot(root_context)
-            correct_drift(self.plant, context, bodies)
-            if self._arm_path is not None:
-                # Do not evaluate the port `robot_state` here: that would keep the Diagram alive
-                # forever.
-                state = robot_state(self.plant, context)
-                self._arm_path.correct(self.plant, context, state, bodies)
-
-    def _let_appear(self, root_context: Context) -> None:
-        """If an object is to appear now, moves it to its place on the table."""
-        if self._feeder is None:
-            return
-        port = self._feeder.get_output_port()
-        index = int(port.Eval(self._feeder.GetMyContextFromRoot(root_context))[0])
-        if index < 0:
-            return
-        assert self.scene.arrivals is not None
-        body = self._bodies[self.scene.arrivals.objects[index]]
-        plant_context = self.plant.GetMyMutableContextFromRoot(root_context)
-        self.plant.SetFreeBodyPose(plant_context, body, self.scene.arrivals.poses[index])
-
-    def _apply_sleep(self, root_context: Context, bodies: Sequence[RigidBody]) -> None:
-        """Freezes objects at rest and thaws the others.
-
-        A frozen object's joint is locked. Its contact with table, fixtures and other frozen objects
-        is filtered out, but bodies that are not frozen still collide with it. If sleep is disabled,
-        only objects outside the cell are frozen, and only in tasks where objects appear.
-        """
-        may_sleep = self.at_rest(root_context)
-        if not self.scenario.sleep.enabled:
-            if self.scene.arrivals is None:
-                return
-            positions = [X_WB.translation() for X_WB in self.object_poses(root_context)]
-            may_sleep = may_sleep & (np.linalg.norm(positions, axis=1) > GONE)
-        plant_context = self.plant.GetMyMutableContextFromRoot(root_context)
-        changed = [
-            (body, resting)
-            for body, resting in zip(bodies, may_sleep.tolist(), strict=True)
-            if resting != body.is_locked(plant_context)
-        ]
-        if not changed:
-            return
-        filters = self.scene_graph.collision_filter_manager(
-            self.scene_graph.GetMyMutableContextFromRoot(root_context)
+    def _free_bodies(self) -> FreeBodies:
+        return FreeBodies(
+            self.plant,
+            self.scene_graph,
+            self.scene,
+            bodies=[item.body for item in self.objects],
+            still_bodies=self.still_bodies,
+            may_sleep=self.scenario.sleep.enabled,
+            feeder=self._feeder,
+            arm_path=self._arm_path,
         )
-        still = [self.plant.get_body(index) for index in self.still_bodies]
-        # Thaw objects first, which allows all their contacts; then freeze others, which filters
-        # some contacts.
-        for body, resting in sorted(changed, key=lambda change: change[1]):
-            own = self._geometry([body])
-            if resting:
-                body.Lock(plant_context)
-                frozen = [other for other in bodies if other.is_locked(plant_context)]
-                others = self._geometry([*still, *frozen])
-                filters.Apply(CollisionFilterDeclaration().ExcludeBetween(own, others))
-            else:
-                body.Unlock(plant_context)
-                others = self._geometry([*still, *bodies])
-                filters.Apply(CollisionFilterDeclaration().AllowBetween(own, others))
 
     @property
     def _bodies(self) -> list[RigidBody]:
         """The bodies of the scene's objects."""
         return [self.plant.get_body(item.body) for item in self.objects]
-
-    def _geometry(self, bodies: Sequence[RigidBody]) -> GeometrySet:
-        geometry = GeometrySet()
-        for body in bodies:
-            geometry.Add(self.plant.GetCollisionGeometriesForBody(body))
-        return geometry
 
 
 def build_station(

@@ -233,7 +233,7 @@ def test_objects_at_rest_fall_asleep(rig: Rig):
     assert results.num_hydroelastic_contacts() == 0
 
 
-def test_a_sleeping_stack_has_no_contacts_until_it_wakes(monkeypatch: pytest.MonkeyPatch):
+def test_a_sleeping_stack_has_no_contacts_until_it_wakes():
     rig = build(Scenario(task=PalletizingBoxes(layers=2), cameras={}))
     for item, goal in zip(rig.objects, rig.scene.goals, strict=True):
         rig.plant.SetDefaultFloatingBaseBodyPose(rig.plant.get_body(item.body), goal.poses[0])
@@ -252,8 +252,7 @@ def test_a_sleeping_stack_has_no_contacts_until_it_wakes(monkeypatch: pytest.Mon
     top = len(rig.objects) - 1
     at_rest = rig.station.at_rest(root)
     at_rest[top] = False
-    monkeypatch.setattr(rig.station, "at_rest", lambda _: at_rest)
-    rig.station._apply_sleep(root, rig.station._bodies)
+    rig.station._free_bodies().apply_sleep(root, at_rest)
     assert locked(rig, root) == [True] * top + [False]
     Simulator(rig.diagram, root).AdvanceTo(root.get_time() + 0.01)
     assert 0 < contacts(root) < max(counts)

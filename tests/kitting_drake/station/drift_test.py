@@ -4,7 +4,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import SpatialInertia
 
-from kitting_drake.station.mass_centres import correct_drift
+from kitting_drake.station.held_bodies import correct_drift
 
 STEP = 1 / 128
 P_COM = np.array([0.05, 0.0, 0.01])
