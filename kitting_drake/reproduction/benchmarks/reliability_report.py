@@ -18,7 +18,13 @@ def reliability_table(measured: dict[str, Any]) -> Table:
     table = Table(title="confidence of decisions", title_justify="left")
     for heading in ("policy", "cameras"):
         table.add_column(heading)
-    for heading in ("decisions", "right", "calibration error", "wrong answers", "right refused"):
+    for heading in (
+        "decisions",
+        "right",
+        "error of the confidence",
+        "wrong, of those above the threshold",
+        "below the threshold, of the right ones",
+    ):
         table.add_column(heading, justify="right")
     for policy, name in _NAMES.items():
         for cameras, found in measured[policy].items():

@@ -93,8 +93,8 @@ def robustness_table(runs: Sequence[Run]) -> str:
         )
     if further:
         parts.append(
-            "The last table has the perturbations that were run on more seeds, with all seeds. "
-            "Each cell ends with the number of objects:\n\n"
+            "The last table has the perturbations that were also run on other seeds. It pools all "
+            "seeds.\nEach cell ends with the number of objects:\n\n"
             + _table(found, [label for label in expected if label in further], counted=True)
         )
     return "\n".join(parts) or "No runs yet.\n"

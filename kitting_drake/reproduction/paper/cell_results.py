@@ -94,8 +94,8 @@ def check_cell(cell: Cell, summary: Summary, rates: Rates) -> None:
         ) from error
     if departure is not None:
         raise UserError(
-            f"run '{cell.name}' does not fit the cell of this name ({departure}): give it another "
-            "name, or remove it (results --remove)"
+            f"run '{cell.name}' does not fit the cell of this name ({departure}): give the run "
+            "another name, or remove it (results --remove)"
         )
 
 
