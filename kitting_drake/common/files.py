@@ -113,7 +113,7 @@ def claim_folder(folder: Path, name: str, described: Any, *, of: str) -> None:
         if json.dumps(found) != json.dumps(described):
             raise UserError(
                 f"{folder} holds the files of another {of}"
-                f"{_first_difference(found, described)}: give another --output, or delete it"
+                f"{_first_difference(found, described)}: delete them, or give another --output"
             )
     write_json(path, described)
 
@@ -132,7 +132,7 @@ def _first_difference(found: Any, described: Any) -> str:
             if isinstance(old, dict) and isinstance(new, dict):
                 return _first_difference(old, new)
             simple = all(isinstance(value, str | float | int | None) for value in (old, new))
-            return f" ({key} is {new}, but {old} there)" if simple else f" ({key} differs)"
+            return f" ({key} is {new}, but {old} in them)" if simple else f" ({key} differs)"
     for key, new in described.items():
         if json.dumps(found[key]) != json.dumps(new):
             return _first_difference(found[key], new) or f" ({key} differs)"

@@ -79,12 +79,12 @@ class Collection:
         found = contents.origin
         if json.dumps(found.scenario) != json.dumps(self._origin.scenario):
             raise UserError(
-                f"{self.path} belongs to another scenario: give another --output, or delete it"
+                f"{self.path} belongs to another scenario: delete it, or give another --output"
             )
         if found.versions != self._origin.versions:
             raise UserError(
                 f"{self.path} was written by {_listed(found.versions)}, but this is "
-                f"{_listed(self._origin.versions)}: give another --output, or delete it"
+                f"{_listed(self._origin.versions)}: delete the file, or give another --output"
             )
         if found.first_seed != self._origin.first_seed:
             raise UserError(

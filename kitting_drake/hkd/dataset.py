@@ -39,7 +39,7 @@ def build_dataset(
         UserError: `folder` is a file, is not empty or cannot be written.
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise UserError(f"{folder} is not an empty folder: give another --output, or delete it")
+        raise UserError(f"{folder} is not an empty folder: delete it, or give another --output")
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".building-") as scratch:

@@ -65,7 +65,7 @@ def parse_action(record: Any, grid: PixelGrid, where: str) -> StepAction:
         UserError: a field is missing or invalid, or pick or place is outside the workspace.
     """
     if not isinstance(record, dict):
-        raise UserError(f"{where} must be an object with pick and place, or with stop: true")
+        raise UserError(f"{where} must be a mapping with pick and place, or with stop: true")
     for flag in ("stop", "press"):
         if not isinstance(record.get(flag, False), bool):
             raise UserError(f"{where}: {flag} must be true or false, not {record[flag]!r}")

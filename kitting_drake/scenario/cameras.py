@@ -63,14 +63,14 @@ class LookAt:
         return _camera_config(self, Transform(look_at(self.position, self.target)))
 
     def validate(self) -> None:
-        """Checks that the camera does not look straight up or down, where upright is undefined.
+        """Checks that the camera does not look straight up or down, where its roll is undefined.
 
         Raises:
             ValueError: the camera looks straight up or down. The caller must put the camera's name
                 before the message.
         """
         if self.position[:2] == self.target[:2]:
-            raise ValueError("looks straight up or down, so upright is undefined: use !Pinhole")
+            raise ValueError("looks straight up or down, so its roll is undefined: use !Pinhole")
 
 
 Camera: TypeAlias = Pinhole | LookAt | CameraConfig

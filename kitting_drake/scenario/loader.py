@@ -232,7 +232,7 @@ def _check_meaning(scenario: Scenario) -> None:
         )
     if -_PLAINLY_BELOW < scenario.heightmap.z_min < 0:
         raise ValueError(
-            f"heightmap.z_min is {scenario.heightmap.z_min:g}, but points so little below the "
+            f"heightmap.z_min is {scenario.heightmap.z_min:g}, but heights so close below the "
             f"table may be calibration errors: use 0, or -{_PLAINLY_BELOW:g} or less"
         )
     if scenario.heightmap.z_max <= scenario.heightmap.z_min:

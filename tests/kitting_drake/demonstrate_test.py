@@ -232,7 +232,7 @@ def only_stop(folder: Path) -> None:
         (action("demo1/step9", at(3.0)), r"step9/action.json: place at \(3, 0\) m is outside"),
         (action("demo1/step9", at(float("nan"))), "place.x must be a finite number"),
         (action("demo1/step9", "{"), "step9/action.json is not JSON"),
-        (action("demo1/step9", [1]), "must be an object with pick and place"),
+        (action("demo1/step9", [1]), "must be a mapping with pick and place"),
         (action("demo1/step9", {"pick": POSES["pick"]}), "place must have x, y and yaw"),
         (
             action("demo1/step9", {**POSES, "pick": {**POSES["pick"], "yaw": 17}}),

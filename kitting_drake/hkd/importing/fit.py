@@ -58,7 +58,7 @@ def true_length(
         real = length * UNITS_MM[unit]
         if not SHORTEST_MM <= real <= LONGEST_MM:
             raise UserError(
-                f"the tool is {real:.4g} mm long ({length:.4g} {unit}), and tools are "
+                f"the tool is {real:.4g} mm long ({length:.4g} {unit}), but tools must be "
                 f"{SHORTEST_MM:g} to {LONGEST_MM:g} mm long: give another --unit, or --length_mm "
                 "to scale it"
             )
@@ -72,8 +72,8 @@ def true_length(
     if not units:
         readings = ", ".join(f"{real:.4g} mm long in {name}" for name, real in lengths.items())
         raise UserError(
-            f"the tool would be {readings}, and tools are {SHORTEST_MM:g} to {LONGEST_MM:g} mm "
-            "long: give --length_mm"
+            f"the tool would be {readings}, but must be {SHORTEST_MM:g} to {LONGEST_MM:g} mm long: "
+            "give --length_mm"
         )
     readings = " or ".join(f"{lengths[name]:.0f} mm long (in {name})" for name in units)
     raise UserError(f"the tool may be {readings}: give --unit, or --length_mm")

@@ -88,11 +88,13 @@ def check_request(request: ImportRequest) -> None:
         raise UserError(f"{request.mesh} is an outline: give the tool's height with --height_mm")
     if not is_outline(request.mesh) and request.height_mm is not None:
         raise UserError(
-            f"--height_mm is for outlines (SVG, DXF), and {request.mesh} is a mesh: leave it out"
+            f"{request.mesh} is a mesh, and --height_mm is only for outlines (SVG, DXF): leave out "
+            "this flag"
         )
     if not is_outline(request.mesh) and request.frame is not None:
         raise UserError(
-            f"--frame is for outlines (SVG, DXF), and {request.mesh} is a mesh: leave it out"
+            f"{request.mesh} is a mesh, and --frame is only for outlines (SVG, DXF): leave out "
+            "this flag"
         )
 
 

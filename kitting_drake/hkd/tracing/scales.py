@@ -141,8 +141,8 @@ def _find_disc(cv2: Any, photo: Photo) -> tuple[Array, float]:
         )
     if len(distinct) > 1:
         raise UserError(
-            f"{photo.path}: {len(distinct)} round objects are visible: leave one disc only, or "
-            "use --scale_px"
+            f"{photo.path}: {len(distinct)} round objects are visible: show only one disc, or use "
+            "--scale_px"
         )
     _, center, radius = distinct[0]
     return _refined_disc(cv2, photo, (center + 0.5) / factor - 0.5, radius / factor)

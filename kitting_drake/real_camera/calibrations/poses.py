@@ -121,8 +121,8 @@ def _as_stated(key: str, found: FoundPose, names: FrameNames) -> FoundPose:
     is_inverse = turned.parent != found.parent
     if bool(turned.in_hand) != (key == "camera_to_hand") or is_inverse != (key == "base_to_camera"):
         raise UserError(
-            f"{found.where} is the pose of {found.child} in {found.parent}, which the name {key} "
-            "contradicts: rename the field to pose"
+            f"{found.where} is the pose of {found.child} in {found.parent}, which contradicts the "
+            f"field's name {key}: rename the field to pose"
         )
     return turned
 

@@ -171,8 +171,8 @@ def _check_depth(frame: Frame, camera: BenchCamera, calibration: Calibration) ->
     towards = np.isfinite(expected)
     if not towards.any():
         raise CalibrationError(
-            f"the workspace is too small for camera {camera.name}, which sees almost no pixel of "
-            "it: give it more rows and cols"
+            f"camera {camera.name} sees almost no pixel of the workspace, because the workspace is "
+            "too small: increase its rows and cols"
         )
     depth = frame.depth[::_STEP, ::_STEP][towards]
     with np.errstate(invalid="ignore"):

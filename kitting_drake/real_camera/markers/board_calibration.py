@@ -117,9 +117,9 @@ def _calibrate_camera(board: Board, paths: Sequence[Path], camera: BenchCamera) 
         alone = max(item.rms for item in singles)
         if fit.rms > alone + _MOVED:
             raise UserError(
-                f"{where}: a common pose for all images has an error of {fit.rms:.2f} pixels, but "
-                f"separate poses at most {alone:.2f}: did the board or the camera move between the "
-                "images?"
+                f"{where}: the error is {fit.rms:.2f} pixels with one pose for all images, but at "
+                f"most {alone:.2f} with a pose for each image: did the board or the camera move "
+                "between the images?"
             )
     corners = sum(len(item.points) for item in seen)
     return CalibratedCamera(camera.name, images[0], seen[0], len(paths), corners, fit)

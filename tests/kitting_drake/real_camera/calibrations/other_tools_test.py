@@ -142,7 +142,7 @@ def test_frames_tell_the_direction(tmp_path: Path):
         "tf2_echo front_color_optical_frame base_link",
     )
     same(read(tmp_path, f"{texts.LENS}    pose: tf", tf=turned).X_BC, np.linalg.inv(X_BC))
-    with pytest.raises(UserError, match="camera_to_base contradicts: rename the field to pose"):
+    with pytest.raises(UserError, match="name camera_to_base: rename the field to pose"):
         read(tmp_path, f"{texts.LENS}    camera_to_base: tf", tf=turned)
     same(read(tmp_path, f"{texts.LENS}    base_to_camera: tf", tf=turned).X_BC, np.linalg.inv(X_BC))
     strange = texts.TF2_ECHO.replace("base_link", "cell").replace("front_color_optical_frame", "A")
