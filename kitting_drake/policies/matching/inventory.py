@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -16,11 +17,17 @@ from systems.signals import Attempt, LeftOver, Observation, PlanarPose
 _THERE = 0.015
 """An object within this distance of an earlier pick or place, in metres, counts as the object that
 was picked or placed there."""
+_SAME_OBJECT = 0.060
+"""If an object was left closer than this to a later pick, in metres, that pick was of this
+object."""
 _MOST_TRIES = 3
 """The largest number of actions on one object."""
 _LEAST_SHARE = 0.5
 """A region that contains an object for an open recess has at least this share of the smallest open
 recess's area."""
+_SEVERAL = 0.75
+"""A region that may contain several objects has at least this share of the total area of as many
+open recesses, the largest ones."""
 _LARGEST_SHARE = 1.6
 """A region of objects for open recesses has at most this multiple of these recesses' total area."""
 
@@ -133,36 +140,40 @@ class Inventory:
         return any(item is region for item in self.reversed_items)
 
     def is_tried(self, region: Region | None) -> bool:
-        """Whether an object was tried often enough. For None the result is False.
+        """Whether the objects of a region were tried often enough. For None the result is False.
 
-        `_MOST_TRIES` attempts are enough. If an object fits into no recess, laying it aside here
-        once is enough.
+        `_MOST_TRIES` actions on one object are enough. A region that fits into no recess is not
+        tried once more if all objects that it can contain were laid there before.
         """
         if region is None:
             return False
         fits_nowhere = self.pair_of(region) is None and not self.is_reversed(region)
-        laid = fits_nowhere and any(
-            attempt.outcome == "placed" and self._is_there(attempt.action.place, region)
-            for attempt in self._history
-        )
-        return laid or self.tries(region) >= _MOST_TRIES
+        laid = sum(moves[-1].outcome == "placed" for moves in self._moves_of(region))
+        if fits_nowhere and laid and not self._may_contain(region, laid + 1):
+            return True
+        return self.tries(region) >= _MOST_TRIES
 
     def tries(self, region: Region) -> int:
-        """Returns the number of earlier actions that moved this object here, or failed to move it
-        away."""
-        return sum(self._is_there(_left_at(attempt), region) for attempt in self._history)
+        """Returns how many earlier actions moved an object to this region, or failed to move it
+        away. Of several objects, the one with the most actions counts."""
+        counts = [
+            sum(self._is_there(_left_at(attempt), region) for attempt in moves)
+            for moves in self._moves_of(region)
+        ]
+        return max(counts, default=0)
 
     def was_removed(self, region: Region) -> bool:
-        """Whether earlier actions first took an object out of this region, and then placed an
+        """Whether earlier actions took an object out of this region, and then placed the same
         object here again."""
-        removed = False
-        for attempt in self._history:
-            if attempt.outcome != "placed":
-                continue
-            if attempt.action.aside:
-                removed |= self._is_there(attempt.action.pick, region)
-            elif removed and self._is_there(attempt.action.place, region):
-                return True
+        for moves in self._moves_of(region):
+            removed = False
+            for attempt in moves:
+                if attempt.outcome != "placed":
+                    continue
+                if attempt.action.aside:
+                    removed |= self._is_there(attempt.action.pick, region)
+                elif removed and self._is_there(attempt.action.place, region):
+                    return True
         return False
 
     def balance(self, region: Region) -> NDArray[np.float64] | None:
@@ -172,6 +183,38 @@ class Inventory:
             if attempt.balance is not None and self._is_there(attempt.action.pick, region):
                 return np.asarray(self.observation.grid.to_pixel(attempt.balance))
         return None
+
+    def _moves_of(self, region: Region) -> list[list[Attempt]]:
+        """Returns the earlier actions on each object that was left in a region, oldest first."""
+        return [moves for moves in self._moves if self._is_there(_left_at(moves[-1]), region)]
+
+    @cached_property
+    def _moves(self) -> list[list[Attempt]]:
+        """The earlier actions on each object, oldest first.
+
+        An action is on the object that was left nearest to its pick, if that is within
+        `_SAME_OBJECT`; else on an object that no action was on before.
+        """
+        objects: list[list[Attempt]] = []
+        for attempt in self._history:
+            pick = attempt.action.pick
+
+            def away(moves: list[Attempt], pick: PlanarPose = pick) -> float:
+                left = _left_at(moves[-1])
+                return math.hypot(left.x - pick.x, left.y - pick.y)
+
+            nearest = min(objects, key=away, default=None)
+            if nearest is not None and away(nearest) < _SAME_OBJECT:
+                nearest.append(attempt)
+            else:
+                objects.append([attempt])
+        return objects
+
+    def _may_contain(self, region: Region, count: int) -> bool:
+        """Whether a region is so large that it may contain this many objects for open recesses."""
+        areas = sorted((int(item.mask.sum()) for item in self.open_recesses), reverse=True)
+        largest = areas[:count]
+        return len(largest) == count and bool(region.mask.sum() >= _SEVERAL * sum(largest))
 
     def _was_filled(self, recess: Region) -> bool:
         return any(

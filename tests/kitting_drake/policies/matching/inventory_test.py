@@ -90,11 +90,41 @@ def test_a_heap_is_taken_apart_from_the_top():
 
 
 def test_what_was_laid_aside_and_fits_nowhere_is_left_alone():
-    observation = dataclasses.replace(crossed(), history=(placed_at((62.0, 218.0)),))
+    stranger = np.zeros(GRID.shape, bool)
+    stranger[36:80, 215:226] = True
+    laid = (placed_at((62.0, 218.0)),)
+    observation = dataclasses.replace(scene((stranger, 0.015)), history=laid)
     action = ShapeMatchingPolicy(PLANNER, recover=True)(observation)
     assert action.stop and action.reason == "gave up"
     assert action.left_over is not None
     assert len(action.left_over.objects) == 1 and len(action.left_over.cavities) == 2
+
+
+def test_a_region_that_holds_more_than_was_laid_there_is_taken_apart_again():
+    laid = placed_at((62.0, 218.0))
+    policy = ShapeMatchingPolicy(PLANNER, recover=True)
+    assert policy(dataclasses.replace(crossed(), history=(laid,))).aside
+    # There are two open recesses, so the region counts as two objects at most.
+    other = placed_at((62.0, 240.0))
+    other = dataclasses.replace(
+        other, action=dataclasses.replace(other.action, pick=PlanarPose(0.6, 0.45))
+    )
+    assert policy(dataclasses.replace(crossed(), history=(laid, other))).reason == "gave up"
+
+
+def test_where_other_objects_were_laid_before_an_object_is_not_given_up():
+    alone = scene((hammer(60, 180), 0.015))
+    away = [(30.0 + 40 * k, 300.0) for k in range(3)]
+    history = []
+    for start in away:
+        # Each of three objects is laid where the hammer lies now, and then taken away.
+        x, y = GRID.to_world(start)
+        come, go = placed_at((71.0, 200.0)), placed_at((71.0, 200.0), pick=True, aside=False)
+        come = dataclasses.replace(
+            come, action=dataclasses.replace(come.action, pick=PlanarPose(float(x), float(y)))
+        )
+        history += [come, go]
+    assert not ShapeMatchingPolicy(PLANNER)(dataclasses.replace(alone, history=tuple(history))).stop
 
 
 def test_an_object_that_fits_is_tried_again_but_not_forever():
@@ -188,3 +218,7 @@ def test_what_lies_on_a_cleared_place_is_taken_out_but_not_twice():
     for history, removed in (((out,), False), ((back, out), False), ((out, back), True)):
         observation = dataclasses.replace(scene((bar(60, 200), 0.015)), history=history)
         assert Inventory.of(observation).was_removed(region) is removed
+    # What was taken out is another object than what was placed there.
+    other = PickPlaceAction(PlanarPose(0.6, 0.45), back.action.place)
+    observation = dataclasses.replace(observation, history=(out, Attempt(other, "placed")))
+    assert not Inventory.of(observation).was_removed(region)
