@@ -93,7 +93,7 @@ def main() -> int:
         identity = {
             **chosen.described,
             "versions": versions(),
-            # Refuse to mix demonstrations from before and after a tool is imported again.
+            # After a tool is imported again, refuse to add to the demonstrations of the old tool.
             "task_digest": files_digest(chosen.scenario.task.input_files(chosen.base)),
         }
         claim_folder(folder, "scenario.json", identity, of="scenario, tools or version")

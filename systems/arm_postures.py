@@ -211,7 +211,8 @@ class ArmPostures:
         return (float(times[best]), [*ways[best][1], q]) if np.isfinite(times[best]) else None
 
     def _times(self, starts: NDArray[np.float64], end: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(n) approximate times of straight motions in joint space from (n, 7) postures, in s."""
+        """(n) the approximate time, in s, of a straight motion in joint space from each of the
+        postures `starts` (n, 7) to the posture `end`."""
         way = np.abs(end - starts)
         top = np.minimum(self._velocity, np.sqrt(way * self._acceleration))
         return np.asarray((way / np.maximum(top, 1e-9) + top / self._acceleration).max(-1))
@@ -297,8 +298,8 @@ class ArmPostures:
 
 
 def _tilts(starts: NDArray[np.float64], end: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(n) the hand's largest tilts on straight lines in joint space from (n, 7) postures, in
-    rad."""
+    """(n) the hand's largest tilt, in rad, on the straight line in joint space from each of the
+    postures `starts` (n, 7) to the posture `end`."""
     share = np.array([0.25, 0.5, 0.75])[:, None, None]
     least = uprightness(starts + share * (end - starts)).min(0)
     return np.asarray(np.arccos(np.clip(least, -1.0, 1.0)))

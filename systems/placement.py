@@ -60,7 +60,7 @@ class PlacedObject:
 
     @property
     def p_BCenter(self) -> NDArray[np.float64]:
-        """(3,) the centre of mass in B or, if it is unknown, `p_BMiddle`."""
+        """(3,) the centre of mass in B or, if it is unknown, the mean of `p_BPoints`."""
         return self.p_BPoints.mean(axis=0) if self.p_BCom is None else self.p_BCom
 
     @cached_property

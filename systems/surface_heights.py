@@ -121,8 +121,8 @@ def _deviation(observation: Observation) -> float:
 
 
 def _sunk(observation: Observation, pixel: NDArray[np.float64]) -> float:
-    """Height of the table relative to the bottom of the grid at a (row, col), in metres. It is 0
-    unless the table is assumed to be lower."""
+    """Height of the table above the bottom of the grid at a (row, col), in metres: negative if the
+    table is assumed to be lower than the grid, else 0."""
     level = float(np.array(observation.table) @ np.append(pixel, 1.0))
     return level if level < -_SUNK else 0.0
 

@@ -54,9 +54,10 @@ def find_table(
     """Finds the table's plane in a heightmap. The table's height at (row, col) is `plane @
     (row, col, 1)`.
 
-    The search starts with a level plane at the lowest frequent height, and refits it to the pixels
-    near it. The result is zero if the plane deviates by less than 0.3 mm from the bottom of
-    the grid, if it is too far off or too steep for a calibration error, or if no plane is found.
+    The search starts with a level plane at the lowest peak of the histogram of heights, and refits
+    the plane to the pixels near it. The result is zero if the plane deviates by less than 0.3 mm
+    from the bottom of the grid, if it is too far off or too steep for a calibration error, or if no
+    plane is found.
 
     Args:
         height: (rows, cols) heights in metres above the bottom of the grid; may be negative.

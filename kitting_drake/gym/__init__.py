@@ -26,7 +26,7 @@ JOINTS = "KittingJoint"
 
 
 def _register_environments() -> None:
-    """Registers `kitting_drake/NAME-v0` for each of `SCENARIOS`, `Scenario` and `JOINTS`."""
+    """Registers `kitting_drake/NAME-v0` for each key of `SCENARIOS`, "Scenario", and `JOINTS`."""
     usual, usual_name = SCENARIOS["KittingUnseen"]
     gymnasium.register(
         f"kitting_drake/{JOINTS}-v0",

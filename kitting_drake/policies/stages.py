@@ -27,7 +27,8 @@ _AS_GOOD = 2.0
 """A rotation counts as equally good if its score is at most this many nats below the best score and
 its place is within `_SAME_PLACE` of the best rotation's place."""
 _SAME_PLACE = 4.0
-"""The largest distance, in pixels, from the best rotation's place; see `_AS_GOOD`."""
+"""The largest distance, in pixels, of an equally good rotation's place from the best rotation's
+place; see `_AS_GOOD`."""
 _TRIES = 4
 """The policy stops after this many proposals whose pick or place is not seen well enough."""
 _ANOTHER = 0.010

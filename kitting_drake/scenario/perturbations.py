@@ -102,7 +102,7 @@ def perturbation(text: str, scenario: Scenario) -> dict[str, Any]:
 
 
 def _applies(name: str, scenario: Scenario) -> bool:
-    """Whether the scenario's task allows a perturbation and has the fields that it sets."""
+    """Whether the scenario's task allows a perturbation and has the field for it."""
     if name in scenario.task.not_perturbed:
         return False
     fields = {item.name for item in dc.fields(scenario.task)}

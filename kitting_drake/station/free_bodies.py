@@ -96,8 +96,8 @@ class FreeBodies:
         filters = self._scene_graph.collision_filter_manager(
             self._scene_graph.GetMyMutableContextFromRoot(root_context)
         )
-        # Thaw objects first, which allows all their contacts; then freeze others, which filters
-        # some contacts.
+        # Thaw before freezing: thawing an object allows all of its contacts, including those that
+        # freezing another object excludes.
         for body, resting in sorted(changed, key=lambda change: change[1]):
             own = self._geometry([body])
             if resting:

@@ -229,8 +229,8 @@ def test_a_complete_stage_keeps_its_reward():
     assert complete_stages(goals, fallen, kept) == kept
     assert (total_reward(goals, fallen), total_reward(goals, fallen, kept)) == (0.25, 0.5)
     assert total_reward(goals, at(*row, top), kept) == 1.0
-    # If an object of a kept stage is moved, the goals of later stages still count. Ravens, too,
-    # drops complete rows.
+    # If an object of a complete stage is moved later, the goals of later stages still count, as in
+    # Ravens.
     moved = evaluate_placements(objects, goals, AddS(), [row[0], away, top], kept)
     assert (moved[1].success, moved[2].success) == (False, True)
     assert total_reward(goals, moved, kept) == 1.0

@@ -177,7 +177,7 @@ def _plain(e: HeadEnd, height: float, thickness: float, start: float) -> tuple[S
 
 
 def _capped(e: HeadEnd, height: float, thickness: float, start: float) -> tuple[Shape, Shape]:
-    """Builds a steel socket and a soft cap, whose length is 44 % of the end's length."""
+    """Builds a steel socket and a soft cap. The cap takes 44 % of the length of the end."""
     size, deep = e.size_mm, e.thickness_mm or e.size_mm
     seam = e.reach_mm - 0.44 * (e.reach_mm - start)
     neck = e.neck_mm

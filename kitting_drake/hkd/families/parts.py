@@ -446,7 +446,7 @@ def _prism(profile: np.ndarray, height: float) -> Shape:
 
 
 def _around(profile: np.ndarray) -> CrossSection:
-    """Returns a square larger than any part. As the only cell of a `plate`, it makes the plate one
+    """Returns a square larger than any part. A `plate` with this square as its only cell has one
     collision hull."""
     return CrossSection.square((2 * LONGEST_MM, 2 * LONGEST_MM), True)
 

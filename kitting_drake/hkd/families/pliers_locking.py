@@ -138,7 +138,7 @@ def build_locking(k: Locking) -> list[Part]:
         )
     ]
 
-    # All flat parts but the jaws share the hulls of one plate, which is as thick as the body.
+    # One set of hulls, as thick as the body, covers all flat parts except the jaws.
     def together(*names: str) -> CrossSection:
         profiles = [
             CrossSection([outlines[name]]) + CrossSection([outlines[name][::-1]]) for name in names

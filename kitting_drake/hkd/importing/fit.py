@@ -138,7 +138,7 @@ def _check_size(solid: Manifold) -> None:
 def _tool(
     category: str, name: str, solid: Manifold, directory: Path, density: float | None
 ) -> Tool:
-    """Returns the tool of a solid with its grasps, and writes the tool's visual mesh.
+    """Makes a tool, with grasps, from a solid. Writes its visual mesh.
 
     Raises:
         UserError: the hand cannot hold the tool.

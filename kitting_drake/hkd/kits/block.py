@@ -179,8 +179,8 @@ def build_block(cavities: Sequence[Cavity], parameters: KitParameters) -> Manifo
 def _add_floor(surface: _Surface, cavity: Cavity, cavities: Sequence[Cavity]) -> None:
     """Adds a cavity's floor: the bounding rectangle of the cavity's outline.
 
-    Other cavities that are at least as deep are cut out of the rectangle: uncut, it would be a
-    shelf or a second floor inside them.
+    Other cavities that are at least as deep are cut out of the rectangle. Otherwise the rectangle
+    would be a shelf or a second floor inside them.
     """
     x_min, y_min, x_max, y_max = cavity.outline.bounds()
     corners = np.array([(x_min, y_min), (x_max, y_min), (x_max, y_max), (x_min, y_max)])

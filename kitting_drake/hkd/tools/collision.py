@@ -178,11 +178,11 @@ def cover(
 ) -> list[np.ndarray]:
     """Covers `hulls` with few convex hulls, which may overlap. The result is deterministic.
 
-    First, hulls are merged if the merged hull hardly sticks out of `outline`. Then each hull is a
-    seed, which is repeatedly merged with the neighbour that adds the least volume. Its xy
-    projection must stay within `allowed`; its other projections may grow by at most `tolerance`
-    (mm). The grown hull that covers the most uncovered volume is selected. This repeats until all
-    of `hulls` are covered. Finally, hulls that hardly change any projection are dropped.
+    First, hulls are merged if the merged hull hardly sticks out of `outline`. Then a hull is grown
+    from each of them: it is repeatedly merged with the neighbour that adds the least volume. The
+    grown hull's xy projection must stay within `allowed`; its other projections may grow by at most
+    `tolerance` (mm). The grown hull that covers the most uncovered volume is selected, until all of
+    `hulls` are covered. Finally, hulls that hardly change any projection are dropped.
     """
     merged = _merged([_Hull(h) for h in hulls], _grown(outline, _EXACT_MM), _EXACT_MM)
     grown = [_grow(seed, merged, allowed, tolerance) for seed in range(len(merged))]

@@ -37,8 +37,8 @@ def fine_tool(tool: Tool, closing_radius: float) -> Tool:
         UserError: the tool's surface is not closed, its model is not valid, or the cache cannot be
             written.
     """
-    # Make the hulls at the original size, so that randomly scaled tools share them. Divide their
-    # tolerances by the scale, rounded up to a power of sqrt(2).
+    # Make the hulls at the original size, so that randomly scaled tools share them. Round the scale
+    # up to a power of sqrt(2), and divide the tolerances by it.
     finer = 2.0 ** (math.ceil(2 * math.log2(tool.scale) - 1e-9) / 2)
     notch = min(NOTCH_MM, 1e3 * closing_radius) / finer
     hulls = _hulls(tool, notch, INSIDE_MM / finer)

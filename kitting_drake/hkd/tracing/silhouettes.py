@@ -101,7 +101,7 @@ def _unclear(cv2: Any, photo: RectifiedPhoto, differ: Array) -> list[Unclear]:
 
 
 def _blended(cv2: Any, photo: RectifiedPhoto, border: Array) -> list[Unclear]:
-    """Returns the stretches of an unclear border, given as a mask (rows, columns)."""
+    """Returns the stretches of unclear border in a mask (rows, columns)."""
     ppm = photo.px_per_mm
     radius = max(1, round(_STRETCH_GAP_MM / 2 * ppm))
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))

@@ -27,8 +27,8 @@ _CLEARLY_BETTER = 0.75
 """An object counts as reversed only if its mirror image's mismatch with the recess is less than
 this share of the object's own mismatch."""
 _PROMISING = 2.0
-"""An object's outline is registered to a recess only if its `coarse_cost` there is at most this
-multiple of its least `coarse_cost` in any recess."""
+"""An object's outline is registered only to recesses whose `coarse_cost` for the object is at most
+this many times the lowest one of all recesses."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,8 @@ def reversed_objects(
 
     Args:
         segmentation: the segmentation of an observation.
-        pairs: the result of `match`. For a paired object the mirror image must fit clearly better.
+        pairs: the result of `match`. A paired object's mirror image must fit clearly better than
+            the object as seen.
         resolution: the side of its pixels, in metres.
 
     Returns:

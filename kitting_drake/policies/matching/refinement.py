@@ -38,8 +38,8 @@ Array = NDArray[np.float64]
 _WORST_COST = 0.0016
 """The largest mean difference of the outlines, in metres, in an accepted fit."""
 _HALF_TURN_GAIN = 0.00005
-"""The fit at the predicted rotation is replaced by another fit only if the other fit's `preference`
-over it exceeds this, in metres."""
+"""Another fit replaces the fit at the predicted rotation only if it is better by more than this, in
+metres (see `preference`)."""
 _RIVAL_GAIN = 0.85
 """Another recess is chosen if its mismatch is less than this share of the predicted recess's
 mismatch."""

@@ -70,7 +70,8 @@ class ShapeMatchingPolicy:
             return matched
         if self._recover:
             arguments = inventory, self._planner, failed_picks
-            # Try the riskiest action last, because the number of actions is limited.
+            # Turn objects over only if nothing else is left to do. This is the riskiest action, and
+            # the number of actions is limited.
             prepared = separating_action(*arguments) or mending or turning_action(*arguments)
             if prepared is not None:
                 return Matched(prepared)

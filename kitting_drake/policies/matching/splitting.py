@@ -56,8 +56,8 @@ _CLEARLY = 0.65
 """An object's outline agrees clearly with the region's outline if at least this fraction of the
 object's outline coincides with it."""
 _LEAST_PART = 0.35
-"""A region can contain an object of a recess only if its area exceeds this share of the recess's
-area."""
+"""A region can contain the object for a recess only if the region's area is more than this share of
+the recess's area."""
 _HIGHER = 0.006
 """Pixels that are higher than an object's median height by more than this, in metres, belong to
 something that lies on the object."""
@@ -144,7 +144,8 @@ def _split(
         rest = rest & ~best.mask
     unexplained = rest.sum() > _UNEXPLAINED * region.mask.sum()
     if unexplained and any(item.shared < _CLEARLY for item in parts):
-        # Reject the split: a large box contains the outlines of many recesses.
+        # Reject the split. The region may be a large box, into which the outlines of many recesses
+        # fit.
         taken -= {item.recess for item in parts}
         parts = []
     if not parts:

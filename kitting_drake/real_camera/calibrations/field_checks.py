@@ -42,7 +42,7 @@ def check_misspelt(
         meant: the names of the expected fields.
         known: the names of fields that are allowed.
         where: the beginning of the error message.
-        likeness: the least similarity of two names, from 0 to 1.
+        likeness: two names resemble each other if their similarity, from 0 to 1, is at least this.
     """
     for key in node:
         close = difflib.get_close_matches(str(key), meant, cutoff=likeness)

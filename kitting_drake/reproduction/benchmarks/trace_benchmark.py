@@ -35,8 +35,8 @@ TOOLS = (
     *("circlip_pliers", "end_nippers", "flat_screwdriver", "locking_pliers", "nut_driver"),
     *("s_wrench", "tack_hammer"),
 )
-"""The tools in the photos. The tracer was developed with photos of the same tools, of other
-seeds."""
+"""The tools in the photos. The tracer was developed with photos of the same tools, but with other
+random seeds."""
 HEIGHTS_MM = (5.0, 12.0, 20.0)
 TILTS = (4.0, 15.0, 25.0)
 GAP_MM = 2.0

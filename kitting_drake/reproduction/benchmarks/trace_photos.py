@@ -63,7 +63,7 @@ class PhotoSpec:
     light: tuple[float, float] = (0.7, 0.4)
     """The shift of a shadow along x and y per unit of height."""
     softness: float = 0.15
-    """The standard deviation of `light` among the lamps, which makes shadows soft."""
+    """The standard deviation of `light` among the lamps. Larger values make softer shadows."""
     falloff: float = 0.25
     """How uneven the light is: roughly its relative change from the sheet's middle to its edge."""
     blur: float = 1.0

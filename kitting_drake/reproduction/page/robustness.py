@@ -42,9 +42,9 @@ def robustness_table(runs: Sequence[Run]) -> str:
     """Writes the tables of strict success on unseen toolsets.
 
     Policies have two tries per tool and may recover. All runs of the first table use the same
-    seeds. The second table has the levels other than moderate, on the first of these seeds. The
-    last table has the cells that ran on more seeds. It uses all their seeds, because leaving some
-    out could flatter the policy.
+    seeds. The second table has the levels mild and severe, on at least the first 12 of these seeds.
+    The last table has the cells that ran on more seeds. It uses all their seeds, because leaving
+    some out could flatter the policy.
 
     Args:
         runs: all runs. Runs of other scenarios, and runs with other weights than the shipped ones,

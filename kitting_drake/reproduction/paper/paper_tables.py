@@ -50,7 +50,7 @@ def _paper_cell(
 ) -> Cell:
     # Networks that do not depend on N are trained once, at the largest N. These are every SO(2)
     # network and, of the Equivariant Transporter, every network except the pick-angle network.
-    # The cells of `_checks` measure the effect.
+    # For comparison, the cells of `_checks` are trained at the N at which they are tested.
     trained_at = ORIENTATIONS[0] if method == "so2" else n
     shared = (
         method == "equivariant_transporter" and n != ORIENTATIONS[0] and TASKS[task].table == "6"

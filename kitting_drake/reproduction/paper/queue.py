@@ -128,8 +128,8 @@ class Queue:
         return folder / "demonstrations.h5"
 
     def _needed(self, policy: Training | str) -> Iterator[Training]:
-        """Yields the trainings of a policy: its own, its base, and the one for its learning
-        rate."""
+        """Yields the trainings that a policy needs: its own, that of its base, and the one that
+        decides its learning rate."""
         if isinstance(policy, str):
             return
         yield policy

@@ -72,8 +72,8 @@ def difference(one: PickPlaceAction, other: PickPlaceAction) -> NDArray[np.float
     """How two actions differ, as an array (3,).
 
     - The distance between the picks, in mm.
-    - Both actions move the object's point at the second pick: the distance between the two places
-      to which it goes, in mm.
+    - The distance between the positions to which the two actions move one point of the object, in
+      mm. This point is at the second pick.
     - The difference between the object's rotations, in degrees.
 
     The last two are zero if different grasps move an object alike.

@@ -24,12 +24,12 @@ ONE_OF_EVERYTHING = [
 
 SETTLED = {"start", "tray", "faces"}
 APART = {Learned: {"avoid_failed_picks"}, Kitting: SETTLED, ToolsetKitting: SETTLED}
-"""By class, the fields that exclude some of the others; `policies_test` and `starts_test` cover
-them."""
+"""By class, the fields that `OneOfEverything` cannot give, because they exclude other fields.
+`policies_test` and `starts_test` cover them."""
 
 
 def reachable(kind: Any) -> set[type]:
-    """The dataclasses of the schema that can occur in a value of a type, including the type."""
+    """The dataclasses of the schema that can occur in a value of type `kind`, and `kind` itself."""
     if kind is PythonTask:  # `own_task_test` covers own tasks.
         return set()
     if dataclasses.is_dataclass(kind):

@@ -279,7 +279,7 @@ def test_sleep_can_be_switched_off():
     root = advance(rig, 0.6, lambda root: asleep.append(locked(rig, root)))
     assert len(asleep) > 70
     assert not np.any(asleep)
-    assert rig.station.at_rest(root).all()  # They rest, but are not frozen.
+    assert rig.station.at_rest(root).all()  # Objects rest, but none is frozen.
 
 
 @pytest.mark.slow

@@ -52,10 +52,10 @@ _GAP = 1.5
 _LEAST_GAP = 0.003
 """The same limit in metres. The larger of `_GAP` and `_LEAST_GAP` applies."""
 _FLAT = 0.0006
-"""The largest deviation, in metres, from a flat floor's median depth. Twice the noise is used
-instead if that is more."""
+"""A pixel agrees with a flat floor if its depth differs from the floor's median depth by less than
+this, in metres, or by less than twice the noise."""
 _FLAT_SHARE = 0.7
-"""On a flat floor, more than this share of the pixels deviates by less than `_FLAT`."""
+"""A floor is flat if more than this share of its pixels agrees (see `_FLAT`)."""
 _BELOW_TOP = 0.001
 """The least depth, in metres, of a surface that counts as below the fixture's top."""
 _NOISY = 0.001

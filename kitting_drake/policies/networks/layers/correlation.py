@@ -46,7 +46,8 @@ def lift(encoding: Tensor, angles: Tensor, size: int) -> Tensor:
     offsets = torch.arange(-reach, reach + 1, dtype=encoding.dtype, device=encoding.device)
     row, col = torch.meshgrid(offsets, offsets, indexing="ij")
     cos, sin = torch.cos(angles)[:, None, None], torch.sin(angles)[:, None, None]
-    # Sample each pixel at its inverse rotation, as (col, row) from -1 to 1.
+    # The (col, row) that the rotation moves to each pixel of the result. `grid_sample` expects it
+    # in the range from -1 to 1.
     source = torch.stack([cos * col - sin * row, cos * row + sin * col], dim=-1)
     grid = source * (2 / (side - 1))
     stack = encoding.expand(len(angles), -1, -1, -1)
@@ -235,7 +236,7 @@ class Candidate:
     """The rotation of `scores[0]`, in bins. Rotations are cyclic, so it may be negative or exceed
     N."""
     corner: tuple[int, int]
-    """The pixel (row, col) of `scores[:, 0, 0]`; all pixels lie in the scene."""
+    """The pixel (row, col) of `scores[:, 0, 0]` in the scene. The window is within the scene."""
 
     def best(self) -> tuple[float, int, int, int]:
         """Returns the largest score with its position, as (score, rotation bin, row, col)."""

@@ -270,7 +270,7 @@ def test_a_tool_weighs_what_the_scale_says(plain: importer.ImportReport, tmp_pat
 
 
 def test_added_surface_is_reported():
-    """Half of a mesh has a large hole, so closing it changes the shape."""
+    """A box without a lid is not closed. The import adds the missing surface and notes it."""
     box = trimesh.creation.box((0.18, 0.02, 0.012)).subdivide().subdivide()
     assert not any("% of its surface" in note for note in solid_of(box)[1])
     box.update_faces(box.triangles_center[:, 2] < 0.0055)

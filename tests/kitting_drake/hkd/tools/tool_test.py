@@ -45,7 +45,7 @@ def test_record_and_meshes_of_the_projects_tools_agree(name: str):
 def test_a_tool_loads_by_path(copy: Path, tmp_path: Path):
     shipped = load_tool("flat_screwdriver")
     assert shipped.directory == MODELS / "tools" / "flat_screwdriver"
-    # The model's file has the name in the tool's record, which is not that of the copied folder.
+    # The model's file is named after the tool, not after the copied folder.
     for tool in (load_tool(str(copy)), load_tool("mine", tmp_path), load_tool("./mine", tmp_path)):
         assert tool.directory == copy
         assert tool.sdf.is_file()

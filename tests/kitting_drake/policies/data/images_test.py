@@ -164,9 +164,10 @@ def barred(theta: float) -> LabelledImage:
 
 
 def middle_line(image: np.ndarray, theta: float, u: float) -> float:
-    """The sideways offset, in pixels, of a bar's centre line from a line in direction `theta`.
+    """The sideways offset, in pixels, of a bar's centre line from a reference line.
 
-    The line passes through the image's centre; the offset is measured `u` pixels along it.
+    The reference line passes through the image's centre in direction `theta`. The offset is
+    measured `u` pixels along it.
     """
     across = np.linspace(-12, 12, 97)
     points = (

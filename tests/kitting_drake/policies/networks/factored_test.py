@@ -49,7 +49,7 @@ class ZeroNetworks(FactoredNetworks):
 
 
 def two_tools() -> LabelledImage:
-    """A scene with two more objects: one outside the image, and one whose pick angle is bin 5."""
+    """`scene(0)` with two added picks: one outside the image, and one whose angle is bin 5."""
     return dataclasses.replace(
         scene(0),
         other_picks=np.array([[-4.0, 30.0], [30.0, 70.0]]),

@@ -118,7 +118,8 @@ def test_the_volume_is_equivariant_to_rotations_by_90_degrees():
     image = sample().image
     volume = networks.pick_volume(image, N)
     assert volume.shape == (N // 2, *image.shape[1:])
-    # Only half of the bins are compared: the network does not know that angles repeat beyond pi.
+    # The bins cover 0 to pi. Compare those that stay below pi after the rotation: the network
+    # does not know that the angle pi is the same as 0.
     found = networks.pick_volume(np.rot90(image, axes=(1, 2)).copy(), N)[N // 4 :]
     expected = volume[: N // 4].rot90(1, (1, 2))
     assert expected.std() > 1e-3

@@ -12,7 +12,7 @@ from kitting_drake.reproduction.paper.parameter_table import (
 
 
 def share(method: str, preset: str) -> float:
-    """The number of parameters, as a fraction of those of the method's original."""
+    """The number of parameters, divided by the number in the method's original networks."""
     return sum(count_parameters(method, preset).values()) / original_parameters(method)
 
 
