@@ -135,8 +135,7 @@ class _Parts:
             if self._gapless() >= count:
                 return None
             batch = next(i for i in range(_MOST_BATCHES) if i not in begun)
-            # Begin no other batch if enough scenes exist, and every batch missing between them has
-            # begun.
+            # Once enough scenes exist, begin only batches that are missing between existing ones.
             if sum(self._counts.values()) >= count and batch > max(self._counts):
                 return None
             begun.add(batch)

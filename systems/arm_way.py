@@ -24,13 +24,13 @@ _SPACING = 0.010
 """Spacing of a path's points, in s: the time that the slowest joint takes from one to the next at
 full speed."""
 _ROUNDING, _WIDER = 0.15, 0.3
-"""Length of the rounded part at each corner of a path, in s as `_SPACING`. `_WIDER` is for paths
-with only one corner."""
+"""Length of the rounded part at each corner of a path, as a time at full speed, in s. `_WIDER` is
+for paths with only one corner."""
 _FEWEST, _MOST = 40, 200
 """Least and largest number of points of a path."""
 _TRIES, _PATIENCE = 8, 3
-"""If a path crosses too low, a higher one is tried. At most `_TRIES` paths are tried. After try
-number `_PATIENCE`, counted from 0, the raises grow."""
+"""If a path is too low, a higher one is tried, up to `_TRIES` paths in all. After try number
+`_PATIENCE`, counted from 0, each new path is raised by more than the one before."""
 _ANY_ACCELERATION = 1e3
 """Acceleration of the yaw on a straight line, in rad/s^2. It is so large that only the joints'
 limits matter."""
@@ -70,7 +70,7 @@ class WayVector(VectorView):
     """Goal of an `over` path: joint positions with the hand at or above the clear height. From
     there the hand sinks to `sink`."""
     clear = Number()
-    """Height of the fingertips above which the hand may travel."""
+    """The clear height: the hand may travel while its fingertips are above it."""
     sink = Number()
     """Height to which the hand sinks at the end of an `over` path."""
     reach = Number()
@@ -232,8 +232,8 @@ class ArmWay:
             missing = self._missing(path, float(way.clear), float(way.reach))
             if missing <= 0.001:
                 return path
-            # Near a rounded corner a little more height may not help, so raise by more with each
-            # try.
+            # Near a rounded corner a little more height may not help, so later tries raise the path
+            # by more.
             raised += (missing + 0.005) * 2 ** max(attempt - _PATIENCE, 0)
         if path is None:
             # The path has no length, so the arm stays where it is.

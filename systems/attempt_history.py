@@ -17,7 +17,7 @@ _SAME_OBJECT = 0.040
 """A measured centre of mass closer than this to a pick, in metres, counts as that of the picked
 object."""
 MOST_LEFT_OVER = 24
-"""At most this many objects, and as many cavities, of a `LeftOver` are stored."""
+"""A stored `LeftOver` has at most this many objects, and at most this many cavities."""
 
 
 class _Row(VectorView):

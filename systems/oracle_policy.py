@@ -41,7 +41,7 @@ _SAME_HEIGHT = 0.005
 def gripper_pose(
     X_WB: RigidTransform, grasp: PlanarPose | Grasp, height: float = 0.0
 ) -> PlanarPose:
-    """The gripper pose in the world that holds an object at X_WB by a grasp.
+    """The world pose of a gripper that holds an object at X_WB by a grasp.
 
     Args:
         X_WB: the object's pose.

@@ -164,7 +164,7 @@ class SmoothMotion:
         return max(1.0, speed.max(), math.sqrt(change.max()), float(np.cbrt(jerk.max())))
 
     def torque_rate(self, limits: ArmLimits, inertia: ArmInertia) -> float:
-        """The largest rate of a joint's torque, as a fraction of the rate that a motion may use."""
+        """The largest ratio of a joint's torque rate to the rate that a motion may use."""
         q, _, a = np.split(self.samples, 3, axis=1)
         rates = np.abs(np.diff(inertia.torques(q, a), axis=0)) / TICK
         return float((rates / limits.torque_rate).max()) / _RATE_SHARE

@@ -98,8 +98,8 @@ class PickPlaceParameters:
     # lateral force.
     force_limit: float = bounded(30.0, 5.0, 140.0)
 
-    # Highest linear speed (m/s) and acceleration (m/s^2) in free space, for (x, y) and z each. An
-    # arm may be slower, because of the limits of its joints.
+    # Highest linear speed (m/s) and acceleration (m/s^2) in free space, separately for the
+    # horizontal and the vertical motion. An arm may be slower, because of the limits of its joints.
     linear_speed: float = bounded(1.2, 0.01, 1.2)
     linear_acceleration: float = bounded(8.0, 0.1, 9.0)
 

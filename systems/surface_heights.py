@@ -38,9 +38,11 @@ _NOISY_RIM_SHARE, _NOISY_RIM_BIAS = 90.0, 1.0
 two thirds of which belong to the rim. The numbers are this percentile, and the estimate's bias in
 standard deviations of the noise."""
 _NOISY_FLOOR_SHARE, _NOISY_FLOOR_BIAS = 25.0, -0.67
-"""The same for the floor's height, by a percentile of the heights at the place."""
+"""The percentile and the bias for the floor's height, which is estimated from the heights at the
+place."""
 _SUNK = 0.003
-"""A table that looks lower than expected by more than this, in metres, is assumed to be lower."""
+"""A table that looks lower than expected by more than this, in metres, is taken to be really lower.
+Any other deviation counts as a calibration error."""
 _TILT_DOUBT, _MOST_DOUBT = 0.3, 0.0025
 """The uncertainty of heights is the noise plus `_TILT_DOUBT` times the table's deviation before
 levelling. This sum is limited to `_MOST_DOUBT`, in metres."""

@@ -110,7 +110,7 @@ class Subprocess:
 def run_in_subprocess(
     function: Callable[..., _Result], *arguments: object
 ) -> _Result | ProcessCrashed:
-    """Calls a function in a fresh process, like `Subprocess.call`."""
+    """Calls a function in a fresh process, by `Subprocess.call`."""
     process = Subprocess()
     try:
         return process.call(function, *arguments)
@@ -126,7 +126,7 @@ class Workers(Protocol):
         """The number of calls that can run at present; at least 1."""
 
     def run(self, function: Callable[..., _Result], *arguments: object) -> _Result | ProcessCrashed:
-        """Calls a function like `Subprocess.call`. This method is thread-safe.
+        """Calls a function in a process, as `Subprocess.call` does. This method is thread-safe.
 
         Processes may be reused, so the function must not depend on earlier calls.
 

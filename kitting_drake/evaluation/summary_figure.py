@@ -48,7 +48,7 @@ class _Look:
 
 @dataclass(frozen=True)
 class _Panel:
-    """A panel of the figure, which shows the distribution of one error."""
+    """A panel of the figure: the distribution of one error."""
 
     title: str
     unit: str

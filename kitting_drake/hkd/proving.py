@@ -49,13 +49,13 @@ def tools_to_prove(tools: Sequence[str], given: Sequence[tuple[str, str]]) -> li
 
     Args:
         tools: the kit's tools, as named on the command line.
-        given: pairs of a tool's name or folder and the tool to put into its cavity instead.
+        given: pairs (tool of the kit, tool to put into its cavity instead), by names or folders.
 
     Returns:
         A folder for each of `tools`; an empty list if `given` is empty.
 
     Raises:
-        UserError: a tool does not exist, or the kit has no tool of a name in `given`.
+        UserError: a tool does not exist, or the first tool of a pair is not in the kit.
     """
     if not given:
         return []

@@ -81,7 +81,7 @@ _MOST_TILT_DEG = 5.0
 _FLAT = np.cos(np.radians(2.0))
 """The cosine of the largest tilt at which a tool lies flat."""
 _ON_TABLE = 0.001
-"""A tool lies flat only if its origin is less than this far from the table, in metres."""
+"""The largest distance from the table, in metres, of the origin of a tool that lies flat."""
 _DEFAULT_VIEWS = 0.4
 """The share of scenes that are seen by the default cameras of scenarios."""
 _WALL = 0.003

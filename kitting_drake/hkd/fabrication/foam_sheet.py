@@ -130,7 +130,7 @@ def fill_sheet(
         copies: the number of copies of each kit; None: copies are added until no more fit.
 
     Raises:
-        UserError: a kit is larger than the sheet without its margins.
+        UserError: a kit is larger than the part of the sheet inside the margins.
     """
     room = (size[0] - 2 * margin, size[1] - 2 * margin)
     for kit in kits:

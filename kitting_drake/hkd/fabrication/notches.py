@@ -30,8 +30,8 @@ a half disc."""
 _FINS = 1.6
 """The limit for thin fins between a notch and its cavity.
 
-The closing in `_notch` fills fins, and a little of the two corners between notch and cavity. The
-filled area may be at most this many times the area filled at two right-angled corners.
+The closing in `_notch` fills fins, and a little of the two corners between notch and cavity. A
+notch is rejected if the filled area is more than this many times that of two right-angled corners.
 """
 _OVERLAP = 0.001
 """The overlap of a notch with its cavity, in metres, so that no thin skin is left between them."""

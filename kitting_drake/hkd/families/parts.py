@@ -79,8 +79,8 @@ class PartError(ValueError):
 def ring(outer: float, inner: float, height: float) -> PartDesign:
     """Designs a bearing or a washer, in mm.
 
-    A ring with an outer diameter of up to 70 mm is held across its outside. A larger ring is held
-    across its rim.
+    A ring up to 70 mm wide is held between opposite points of its outside. A larger ring is held by
+    its rim, with one finger in the bore.
     """
     if not 2.0 <= inner <= outer - 4.0:
         raise PartError(

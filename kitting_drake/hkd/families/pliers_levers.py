@@ -37,7 +37,7 @@ class Levers:
     # The width across the parallel flanks of the joint, and the flanks' length behind the rivet.
     joint_width_mm: float = 28.0
     joint_back_mm: float = 22.0
-    # The distance behind the rivet up to which the handles continue in line with the flanks.
+    # The handles continue in line with the flanks to this distance behind the rivet.
     parallel_mm: float = 44.0
     # The length of the joint in front of the rivet.
     joint_front_mm: float = 9.0

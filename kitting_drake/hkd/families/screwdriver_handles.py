@@ -19,7 +19,7 @@ class HandleSection(NamedTuple):
     place: float
     # The size as a share of the handle's width and height.
     size: float
-    # The depth of the flutes as a share of the handle's full depth of flutes.
+    # The depth of the flutes in this section, as a share of their full depth.
     flute: float = 0.0
 
 

@@ -122,8 +122,8 @@ def _shoulders(p: WrenchParameters, head: Head, side: int) -> CrossSection:
 def _shank_cells(p: WrenchParameters) -> list[CrossSection]:
     """Returns regions that cut the shank into convex parts.
 
-    They leave out what a head covers. The list is empty if the shank is straight and a head other
-    than a tail or a spike has no shoulders.
+    They leave out what a head covers. If a head of a straight shank lacks shoulders, the list is
+    empty. Tails and spikes need no shoulders.
     """
     half, far = p.center_distance_mm / 2, 100.0
     if p.swing_mm:

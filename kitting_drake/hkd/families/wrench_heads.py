@@ -45,7 +45,7 @@ class Head:
     thickness_mm: float = 8.8
     # The angle between the head's axis and the shank, in degrees.
     angle_deg: float = 0.0
-    # The number of points of a closed head: 6 for a hexagon, 12 for two.
+    # The number of points of a closed head: 6 (one hexagon) or 12 (two hexagons).
     points: int = 12
     # The distance from the head's centre at which straight shoulders meet the shank; 0 for no
     # shoulders.

@@ -1,8 +1,7 @@
 """The grip: the faces between which the jaws hold a tool from above.
 
-The closing pads meet the part of the surface between them that stands out farthest. So a grip is
-the extent, along the closing direction, of the surface between the two planes through the pads'
-ends.
+Only the surface between the two planes through the pads' ends matters. The closing pads touch it
+where it stands out farthest. So the extent of this surface along the closing direction is the grip.
 """
 
 from dataclasses import dataclass

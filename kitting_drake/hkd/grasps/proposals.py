@@ -40,7 +40,7 @@ RELEASE_REACH = PLANNER.release_clearance + FINGERTIP_DEPTH
 # first value is for the fine search, the second one for the coarse search.
 _TOUCH = 0.0003
 _COARSE_TOUCH = 0.0008
-# The distance from the middle of a tool in its kit to a neighbouring tool.
+# In a kit, the neighbouring tools are assumed to be this far from the middle of a tool.
 _LANE = 0.040
 
 _STEP = 0.001

@@ -28,7 +28,8 @@ _AREA = 2e-3
 # number of cuts.
 _SHARE, _VOLUME, _LEVELS, _MOST_CUTS = 0.08, 8.0, 9, 2
 _TIP = 1.0
-"""The distance in mm within which a cell can be extended to a tip of the outline."""
+"""A cell can be extended to a tip of the outline if the tip is within this distance of the cell's
+bounds, in mm."""
 _THINNEST_MM = 0.6
 """The least height of a cut piece, in mm."""
 

@@ -37,7 +37,7 @@ hollow part: it is equally far from the whole wall.
 """
 
 _REACH_MM = 0.75
-"""The assumed largest distance in mm between two shifts of the copy: the one that best fits the
+"""Two shifts of the copy are assumed to differ by at most this, in mm: the one that best fits the
 surfaces, and the one that best fits the outlines."""
 
 Shift = NDArray[np.float64]

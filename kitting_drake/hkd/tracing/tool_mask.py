@@ -27,7 +27,7 @@ _EDGE_MM = 2.3
 _SHINE_STEEP = 0.6
 """The largest slope of the edge of a specular reflection, in logarithms of light per mm."""
 _STEP_REACH_MM = 1.5
-"""The radius around a pixel, in mm, of the area in which a step of light is measured."""
+"""The radius around a pixel, in mm, of the area in which a brightness step is measured."""
 _SHINY, _SHINY_SHARE = 0.06, 0.25
 """A bay or hole of a tool's mask is a reflection if more than `_SHINY_SHARE` of its pixels are
 brighter than the ground by more than `_SHINY`, in logarithms of light."""
@@ -42,12 +42,12 @@ at least the share `_GLARE_SHARE` is brighter than the ground."""
 _BAY_MM = 12.0
 """Bays and holes may be reflections if they are at most twice this wide, in mm."""
 _BLENDED_MM, _SHADED = 1.2, 0.06
-"""A tool blends into a shadow where the step of light is wider than `_BLENDED_MM` and the shadow is
-darker than `_SHADED`, in logarithms of light."""
+"""A tool blends into a shadow where the brightness step is wider than `_BLENDED_MM` and the shadow
+is darker than `_SHADED`, in logarithms of light."""
 _NEUTRAL = 0.05
 """The largest difference in colour between shaded and lit ground, in logarithms of light."""
 _LARGEST_HOLE_MM2 = 500.0
-"""The largest area of a hole that lies wholly in shadow, in mm^2. Strips may be larger."""
+"""The largest area, in mm^2, of a hole that lies wholly in shadow. A strip may be larger."""
 _UNLIKE_SHARE = 0.3
 """At least this share of a tool's pixels differs from the ground."""
 _LEAST_AREA_MM2 = 40.0
@@ -64,8 +64,8 @@ class ShadowLook:
     rough: float
     """The largest ratio of a shadow's roughness to that of the plain ground."""
     shine: float
-    """A step of light is soft if it is wider than this, in mm. A bay or hole is a reflection if its
-    border with the tool is soft on at least 30 % of its length."""
+    """A brightness step is soft if it is wider than this, in mm. A bay or hole is a reflection if
+    its border with the tool is soft on at least 30 % of its length."""
 
 
 CAREFUL = ShadowLook(0.3, 2.0, 1.2)
@@ -78,7 +78,7 @@ the mask for these limits differs from the mask for `CAREFUL` or `MIDDLE`."""
 _LOW_MM = 9.0
 _COARSE_PX_PER_MM = 3.5
 _FINE_PX_PER_MM = 5.0
-"""Below this resolution, blur widens the steps of light, so the limits of a step's width are
+"""At lower resolutions than this, blur widens brightness steps, so the limits of their width are
 raised."""
 
 
@@ -102,7 +102,7 @@ class ToolMasks:
     def __init__(
         self, cv2: Any, ratio: Array, ground: Array, spread: float, px_per_mm: float
     ) -> None:
-        """Measures lightness, colour, roughness and steps of light in the photo.
+        """Measures lightness, colour, roughness and brightness steps in the photo.
 
         Args:
             cv2: OpenCV.
@@ -125,7 +125,7 @@ class ToolMasks:
         even = cv2.GaussianBlur(light, (0, 0), 0.5 * px_per_mm)
         self._rough = _roughness(cv2, light, even, px_per_mm)
         self._usual = _median(self._rough[self._plain & ground], _ROUGH)
-        # The slope and the width of the steepest step of light near each pixel.
+        # The slope and the width of the steepest brightness step near each pixel.
         self._peak = cv2.dilate(self._steep, _disc(cv2, 0.7 * px_per_mm))
         disc = _disc(cv2, _STEP_REACH_MM * px_per_mm)
         span = cv2.dilate(self._lightness, disc) - cv2.erode(self._lightness, disc)
@@ -137,8 +137,8 @@ class ToolMasks:
         """Returns a mask (rows, columns): 1 where a tool hides the ground.
 
         Pixels that look like the ground are ground. Shadows count as ground, too: these are pixels
-        without colour that no steep step of light separates from the ground. All other pixels are
-        tools. A watershed moves the border of the tools to the steepest step of light nearby.
+        without colour that no steep brightness step separates from the ground. All other pixels are
+        tools. A watershed moves the border of the tools to the steepest brightness step nearby.
         """
         cv2, ground, px_per_mm, noise = self._cv2, self._ground, self._px_per_mm, self._noise
         free = (self._steep < look.steep * noise) & (self._colour < _COLOURED * noise)
@@ -155,7 +155,7 @@ class ToolMasks:
         shaded = free & (self._fine < 2 * limit) & ~reached
         reached |= _shaded_holes(cv2, shaded, like_ground, px_per_mm)
         # The edge of a tool is rough on both sides. So extend the ground over rough pixels, up to
-        # a steep step of light.
+        # a steep brightness step.
         for _ in range(math.ceil(_EDGE_MM * px_per_mm)):
             grown = cv2.dilate(reached.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
             reached |= grown & free
@@ -211,8 +211,8 @@ class ToolMasks:
     def _without_shine(self, tool: Array, widest: float) -> Array:
         """Fills the bays and holes of a mask that are reflections on a tool.
 
-        Their border with the tool is soft, or they are brighter than the ground. A step of light
-        that is wider than `widest`, in mm, is soft.
+        Their border with the tool is soft, or they are brighter than the ground. A brightness
+        step that is wider than `widest`, in mm, is soft.
         """
         cv2, px_per_mm = self._cv2, self._px_per_mm
         closed = _closed(cv2, tool, _BAY_MM * px_per_mm, px_per_mm)
@@ -230,14 +230,14 @@ class ToolMasks:
             if not border.any():
                 continue
             soft = np.median(self._peak[box][border]) < _SHINE_STEEP
-            # A reflection may have a sharp edge on one side, so a soft edge on 30 % is enough.
+            # Part of a reflection's border may be sharp: it is enough if 30 % is soft.
             soft |= np.percentile(self._width[box][border], 70) > widest
             if soft or (self._lightness[box][bay] > _SHINY).mean() > _SHINY_SHARE:
                 filled[box][bay] = 1
         return filled
 
     def _bordered(self, tool: Array) -> Array:
-        """Moves the border of a mask to the steepest step of light nearby."""
+        """Moves the border of a mask to the steepest brightness step nearby."""
         cv2, px_per_mm = self._cv2, self._px_per_mm
         markers = np.zeros(tool.shape, np.int32)
         markers[cv2.dilate(tool, _disc(cv2, 0.4 * px_per_mm)) == 0] = 1

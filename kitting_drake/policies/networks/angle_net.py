@@ -28,9 +28,9 @@ class AngleNetSize:
     """Whether the last layer's kernel covers the whole feature map. Otherwise the last layer is
     padded, and its output is averaged."""
     residual: bool = False
-    """Whether each stage of two layers is a residual block; the first stage must then not have two
-    layers. If a block changes the number of fields, its shortcut is a convolution with the same
-    kernel size."""
+    """Whether each stage of two layers is a residual block. The first stage cannot be one, so it
+    must not have two layers. If a block changes the number of fields, its shortcut is a convolution
+    with the same kernel size."""
 
     def __post_init__(self) -> None:
         if self.residual and len(self.stages[0]) == 2:

@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 _ORTHOGONAL = 1e-3
 """The largest accepted difference between an entry of R^T R and that of the identity."""
 _FARTHEST = 20.0
-"""The distance of a camera from the base, in metres, above which its position is probably not in
+"""If a camera is farther than this from the base, in metres, its position is probably not in
 metres."""
 _POSITIONS = ("position", "translation")
 _ROTATIONS = ("orientation", "quaternion_xyzw", "rotation", "rpy_deg", "rvec")

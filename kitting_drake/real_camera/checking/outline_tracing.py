@@ -43,8 +43,8 @@ def trace(mask: Mask, grid: PixelGrid) -> Polygon:
         grid: the cells of the mask.
     """
     inner = ndimage.binary_erosion(mask, disc(_INSIDE / grid.resolution))
-    # Remove narrow spikes, for instance between two objects at the table's edge: they have no room
-    # for a tool.
+    # Remove narrow spikes, for instance between two objects at the table's edge, because no tool
+    # fits there.
     smooth = ndimage.binary_opening(inner, disc(2 * _INSIDE / grid.resolution))
     for candidate in (smooth, inner, mask):
         if candidate.any():

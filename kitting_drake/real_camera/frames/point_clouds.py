@@ -22,7 +22,7 @@ _OFF = 2.0
 """The largest median distance, in pixels, between the points of an organised cloud and their
 pixels. If it is larger, the cloud belongs to another lens."""
 _METRES = 50.0
-"""The depth in metres above which depths are probably in millimetres."""
+"""If the median depth exceeds this, in metres, the cloud is probably in millimetres."""
 
 
 def read_cloud(

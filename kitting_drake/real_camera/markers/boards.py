@@ -39,7 +39,7 @@ _LEVEL = math.radians(3)
 _TOUCHED = 0.003
 """The largest accepted error of the distance between touched corners, in metres."""
 _LARGEST = 2.0
-"""The size in metres above which a board's sizes are probably in millimetres."""
+"""If a board is larger than this, in metres, its sizes are probably in millimetres."""
 
 
 @dataclass(frozen=True)
@@ -209,8 +209,8 @@ def _find_markers(cv2: Any, board: Board, gray: Any) -> tuple[dict[int, Array], 
 def _centred(cv2: Any, gray: Any, quads: list[Array]) -> list[Array]:
     """Corrects the corners (4, 2) of markers for the shift that their refinement causes.
 
-    OpenCV's AprilTag refinement shifts all corners by about 0.4 pixels. A second refinement, which
-    is noisier but has no such bias, shows the exact shift.
+    OpenCV's AprilTag refinement shifts all corners by about 0.4 pixels. Another refinement is
+    noisier but has no such bias. The mean difference between the two is the exact shift.
     """
     if not quads:
         return []

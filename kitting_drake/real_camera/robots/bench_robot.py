@@ -22,7 +22,7 @@ from systems.signals import PickPlaceAction, SurfaceHeights
 
 _FIELDS = ("model", "base", "yaw_deg", "home", "joints", "rate")
 _FARTHEST = 3.0
-"""The size of a coordinate, in metres, above which it is probably in millimetres."""
+"""A coordinate that exceeds this, in metres, is probably in millimetres."""
 
 
 @dataclass(frozen=True)

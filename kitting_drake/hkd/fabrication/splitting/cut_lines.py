@@ -57,7 +57,7 @@ class Cuts:
     """The cuts that divide a block, and the pieces."""
 
     lines: tuple[Line, ...]
-    """All cuts. Those along x have the block's whole length, although they divide only a strip."""
+    """All cuts. Each cut along x is as long as the block, although it divides only one strip."""
     regions: tuple[CrossSection, ...]
     """The outlines of the pieces from above, strip by strip."""
     cost: float

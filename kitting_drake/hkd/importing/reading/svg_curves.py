@@ -142,7 +142,7 @@ def _scale(root: ElementTree.Element, text: bytes, unit_mm: float | None) -> tup
 
 
 def _paper(sides: list[float]) -> tuple[str, float]:
-    """Finds the standard sheet of paper whose size a page has in some unit.
+    """Finds a standard sheet of paper, and a unit in which a page has the sheet's size.
 
     Args:
         sides: the page's sides in units, the shorter first.

@@ -164,9 +164,9 @@ class Segmentation:
     def _is_fragment(self, recess: Region) -> bool:
         """Whether a region is only a fragment of a filled recess.
 
-        If so, a larger area beside it lies slightly below the fixture's top: the top of the object
-        in the recess. In a free recess, only narrow slots look so shallow, because no camera sees
-        their floor. Such slots are smaller than the region.
+        Beside such a fragment, the top of the object in the recess is visible. It lies slightly
+        below the fixture's top and is larger than the region. A free recess looks so shallow only
+        in narrow slots, whose floor no camera sees. These slots are smaller than the region.
         """
         if self.noise > CLEAN:
             return False
