@@ -377,8 +377,8 @@ def test_a_repeatedly_killed_run_collects_the_same_file(verb_process, tmp_path: 
     assert done.returncode == 0, done.stderr
     command = [sys.executable, "-m", "kitting_drake.collect", scenario, *counts]
     rng = random.Random(0)
-    # Kill the run when it has kept `more` further seeds, whatever the machine's speed is.
-    # If `more` is 0, kill it at a random time before it keeps one.
+    # Kill the run as soon as it has kept `more` further seeds. If `more` is 0, kill it at a random
+    # time, at the latest when it has kept one more.
     for more in (0, 1, 0, 2, 1, 0, 1, 2):
         process = subprocess.Popen(
             [*map(str, command), "--output", killed], cwd=ROOT, stdout=subprocess.DEVNULL

@@ -257,7 +257,7 @@ def test_writes_the_trajectory_of_a_robot_or_says_what_is_out_of_reach(tmp_path:
     rows = (tmp_path / "out" / "trajectory.csv").read_text().splitlines()
     assert len(rows) == 1 + len(message["points"])
     assert rows[0].startswith("time_from_start,position_fr3_joint1,")
-    # If the arm cannot reach the pick, nothing is written that could move it.
+    # If the arm cannot reach the pick, no trajectory is written.
     robot.write_text("{base: [-0.3, 0.9, 0], home: [-0.3, 0.5, 0.4, 0]}")
     assert verb("decide", *arguments).returncode == 0
     record = json.loads((out / "action.json").read_text())

@@ -138,7 +138,7 @@ def test_a_folder_of_other_weights_or_another_number_type_is_refused(
 def test_a_folder_of_other_code_or_input_files_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """The scenario's text is the same, but its files or versions differ."""
+    """The scenario's text stays the same, but a file that it uses changes."""
     monkeypatch.syspath_prepend(tmp_path)
     source = tmp_path / "policy_of_mine.py"
     tool = tmp_path / "my_tool"

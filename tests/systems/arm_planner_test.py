@@ -120,7 +120,7 @@ def test_an_arm_does_what_it_can_reach_and_refuses_the_rest():
         Mode.DONE,
     ]
     assert [attempt.outcome for attempt in history] == ["unreachable", "placed"]
-    # The arm does not move for the first action.
+    # During the first action, which is refused, the arm does not move.
     moving = np.flatnonzero(np.abs(motions[:, 7:14]).max(axis=1) > 0)
     assert moving[0] / 128 > 0.2
 

@@ -66,7 +66,7 @@ def disagreements(count: int, model: str, seed: int) -> int:
 
 
 def test_the_cells_workspace():
-    """The expected shares were measured once, on a grid of 50 mm with the workspace's edges."""
+    """The expected shares were measured once, on a grid of 50 mm up to the workspace's edges."""
     x, y = np.linspace(0.25, 0.75, 11), np.linspace(-0.5, 0.5, 21)
     points = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
     reach = ReachMap(FR3, np.linspace(0.02, 0.28, 6))

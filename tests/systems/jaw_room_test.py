@@ -11,7 +11,7 @@ PICK = PlanarPose(0.5, 0.1, 0.0)
 
 
 def width(*bars: tuple[float, float, float], pick: PlanarPose = PICK, top: float = 0.02) -> float:
-    """`object_width` at the pick, where bars along x have a middle y, a width and a height."""
+    """`object_width` at the pick. Each bar lies along x: its middle y, its width, its height."""
     y = GRID.to_world(np.stack(np.indices(GRID.shape), -1))[..., 1]
     height = np.zeros(GRID.shape, np.float32)
     for middle, across, tall in bars:

@@ -161,10 +161,10 @@ def test_interchangeable_objects_fill_each_others_goals():
 
 
 def test_a_correct_row_keeps_its_goals_beside_another_object():
-    """The first two objects are 2 mm from their goals, and the third is beside the row.
+    """The first two objects are 2 mm from their goals, and the third lies before the row.
 
-    Assigning each object to the next goal would reduce the total displacement, but must not be
-    preferred.
+    If the third object took the first goal, and the others the second and third goals, the total
+    displacement would be smaller. But then no object would be at its goal.
     """
     row = [planar(0, 0.05 * k) for k in range(3)]
     goals = [goal(0, 1, 2, pose=pose, reward=1 / 3) for pose in row]

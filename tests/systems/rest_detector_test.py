@@ -134,7 +134,7 @@ def test_an_awake_neighbour_wakes_a_sleeper():
     table = Table()
     table.poses[RIGHT] = RigidTransform([0, 0.1 - 0.02 - BESIDE, 0])
     assert table.at_rest_after(1.0) == [True, True]  # Adjacent bars may rest.
-    # The hand touches the far side of the left bar only.
+    # The hand is near the left bar, on the side away from the right bar.
     table.poses[HAND] = RigidTransform([0, 0.1 + 0.01 + 0.02 + BESIDE, 0])
     assert table.at_rest_after(1 / 64) == [False, False]
     # If the right bar is moved away, only the left one, which is near the hand, stays awake.

@@ -100,7 +100,7 @@ def test_a_grasp_too_wide_for_the_jaws_is_rejected(models: Path, tmp_path: Path)
     with pytest.raises(UserError, match="65 mm"):
         save_grasp(tool, along)
     assert load_tool(str(own)).grasp == tool.grasp
-    # If the record is edited by hand, building a scene rejects the grasp.
+    # If such a grasp is written into the record by hand, building a scene rejects it.
     record = yaml.safe_load((own / "tool.yaml").read_text())
     record["grasp"]["width"] = along.width
     (own / "tool.yaml").write_text(yaml.safe_dump(record))

@@ -12,7 +12,7 @@ def bar() -> trimesh.Trimesh:
 
 
 def ring() -> trimesh.Trimesh:
-    """A ring whose underside lies between two rims, one inside the other."""
+    """A ring: its underside lies between an outer and an inner rim."""
     return trimesh.creation.annulus(60, 90, 12).subdivide_to_size(12.0)
 
 

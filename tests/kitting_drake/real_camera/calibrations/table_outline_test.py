@@ -95,7 +95,7 @@ def test_invalid_outlines_are_refused(tmp_path: Path, fields: dict[str, object],
 
 
 def beside_a_drop() -> tuple[dict[str, Frame], Calibration]:
-    """A camera's frame of a table up to y = 0.1. Beyond it, the surface is 60 mm higher."""
+    """A camera's frame of a table that ends at y = 0.1, beside a surface that is 60 mm higher."""
     front = Calibration(TRUE.cameras[:1], TRUE.grid)
     low = cast(front)["front"]
     grid = dataclasses.replace(TRUE.grid, z_min=0.06)

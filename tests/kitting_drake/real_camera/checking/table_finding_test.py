@@ -27,7 +27,7 @@ TOP: Box = ((0.30, 0.70), (-0.30, 0.35), TABLE)
 KIT: Box = ((0.45, 0.67), (0.05, 0.30), TABLE + 0.04)
 POST: Box = ((0.32, 0.40), (-0.05, 0.05), TABLE + 0.25)
 EDGE: Box = ((0.30, 0.70), (-0.33, -0.30), TABLE + 0.03)
-"""A profile along the table's edge, 30 mm higher than the table."""
+"""A rail along the table's edge, 30 mm higher than the table."""
 
 
 def camera(degrees: float = 35.0) -> Calibration:
@@ -74,7 +74,7 @@ def test_a_table_above_the_floor_is_found():
     region = calibration.outline.region
     assert 4 <= len(region) <= 12
     # The first three points are on the table, some of them below the kit. The others are on the
-    # profile or beside the table.
+    # rail or beside the table.
     xy = [[0.5, 0.2], [0.65, 0.28], [0.35, -0.25], [0.5, -0.32], [0.5, 0.37], [0.28, 0.0]]
     assert calibration.contains(np.array(xy)).tolist() == [True] * 3 + [False] * 3
     x, y = np.array(region).T

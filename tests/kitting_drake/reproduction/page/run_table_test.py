@@ -24,7 +24,7 @@ FIRST: dict[str, Any] = {
     "resolved_scenario": {"task": {"_tag": "!Kitting"}},
 }
 SECOND: dict[str, Any] = {
-    # Some texts look like a number, JSON or nothing, and some keys look like columns of the table.
+    # Some texts look like numbers or JSON, or are empty. Some keys look like columns of the table.
     "policy": 'a, "b"\nc',
     "details": {"steps": "3", "rate": "null", "weights": "", "of": {"a.b": 1}, "commit": "1e5"},
     "seeds": [9, 7],
