@@ -193,8 +193,8 @@ def run_in_worker(
 ) -> Episode:
     """Runs one episode in another process and waits for it.
 
-    If the process dies, a failed episode with the reason is returned. If the process was killed
-    from outside, it is first started once more.
+    If the process crashes, a failed episode with the reason is returned. If it is killed from
+    outside, it is started once more.
 
     Args:
         workers: the workers that start the process.

@@ -80,8 +80,8 @@ class ArmPostures:
         return np.array(hand_state(q.tolist(), [0.0] * JOINTS, self.base)[:4])
 
     def within(self, q: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Returns (...) whether joint positions (..., 7) are at least `MARGIN` away from the ends
-        of their ranges. It is False for NaN."""
+        """Whether joint positions (..., 7) are at least `MARGIN` away from the ends of their
+        ranges, as an array (...); False for NaN."""
         with np.errstate(invalid="ignore"):
             return np.asarray(((q >= self._lower) & (q <= self._upper)).all(-1))
 

@@ -136,8 +136,8 @@ def quintic(
         step: time between the points, in s.
         since: time from the first point to the time of evaluation, in s.
     """
-    # Subtract the parabola that has the given derivatives at the first point. The difference is a
-    # polynomial in since / step with powers 3 to 5.
+    # Subtract the parabola with the given value and derivatives at the first point. The difference
+    # is a polynomial in s = since / step with the powers 3 to 5.
     h = step
     first = q[1] - q[0] - h * v[0] - h * h / 2 * a[0]
     second = h * (v[1] - v[0] - h * a[0])

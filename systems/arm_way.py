@@ -24,8 +24,8 @@ _SPACING = 0.010
 """Spacing of a path's points, in s: the time that the slowest joint takes from one to the next at
 full speed."""
 _ROUNDING, _WIDER = 0.15, 0.3
-"""Length of the rounded part at each corner of a path, as a time at full speed, in s. `_WIDER` is
-for paths with only one corner."""
+"""Length of the rounded part at each corner of a path. Like `_SPACING`, it is a time, in s.
+`_WIDER` is for paths with only one corner."""
 _FEWEST, _MOST = 40, 200
 """Least and largest number of points of a path."""
 _TRIES, _PATIENCE = 8, 3

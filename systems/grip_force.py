@@ -29,14 +29,14 @@ _SOFT, _SOFT_SHARE = 0.006, 0.2
 """If the jaws sink farther into an object than `_SOFT`, in m, or than `_SOFT_SHARE` of its width,
 they press less."""
 _MUCH_LESS = 0.85
-"""If the jaws sink into an object, their force is lowered only if it becomes at most this fraction
-of the present force."""
+"""When the jaws sink into an object, small decreases of their force are ignored: a lower force must
+be at most this fraction of the present one."""
 _GENTLE, _GENTLEST = 0.5, 0.25
 """Fractions of the acceleration limits. An object that may turn is moved with at most `_GENTLE` of
 them; no object is moved with less than `_GENTLEST` of them."""
 _GENTLER = 0.8
-"""The acceleration is lowered only to less than this fraction of the present one, because each
-change restarts the motion."""
+"""Small decreases of the acceleration are ignored, because each change restarts the motion: a lower
+acceleration must be below this fraction of the present one."""
 _LEAST_CHANGE = 1.05
 """The force rises only in steps of at least this factor, so that noise does not restart its
 ramp."""

@@ -17,8 +17,8 @@ is released, as fractions of the width of the side that rests on the block."""
 _MOST_OUTSIDE = 0.008
 """Largest distance of the centre of mass beyond the edge, in metres."""
 _BESIDE = 0.005
-"""The object must rest on the block on both sides of its centre of mass: at points that are more
-than this away from it along the edge, in metres."""
+"""Along the edge, the object must rest on the block on both sides of its centre of mass. Points
+closer to the centre of mass than this, in metres, do not count."""
 _FROM_CORNER = 0.02
 """Distance of the centre of mass from the block's corner along the edge, in metres. The object then
 reaches beyond the corner, where the hand can grip it again."""

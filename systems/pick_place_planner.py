@@ -367,7 +367,7 @@ def _action_of(state: PlannerState) -> PickPlaceAction:
 
 
 def _outcome(before: float, state: PlannerState) -> str:
-    """The outcome of an action, a word of `OUTCOMES`, judged by the mode before `RETREAT`."""
+    """The outcome of an action, one of `OUTCOMES`. `before` is the mode before `RETREAT`."""
     if state.refused:
         return "unreachable"
     if state.stops:

@@ -69,7 +69,7 @@ class PlannerState(VectorView):
     payload = Number()
     """The vertical force of the payload on the hand, in N; negative or zero."""
     felt_payload = Number()
-    """The last vertical force of the payload, in N, before the payload was weighed."""
+    """The vertical force of the payload, in N, as last measured before the payload was weighed."""
     weighings = Number()
     """Number of samples in the mean that gives `payload`."""
     beyond = Number()
@@ -110,8 +110,8 @@ class PlannerState(VectorView):
     set_downs = Number()
     """Number of earlier actions that set this object down again."""
     free_actions = Number()
-    """Number of actions that do not count against the limit, because they set the object down
-    again."""
+    """Number of actions so far that set their object down again. They do not count against the
+    limit of actions."""
     stop = Number()
     """0 until the planner stops; then 1 plus the index of the reason in `STOP_REASONS`."""
 

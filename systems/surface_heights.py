@@ -34,9 +34,9 @@ average."""
 _FLAT = 0.012
 """Squares whose heights range over more than this, in metres, contain edges and are not flat."""
 _NOISY_RIM_SHARE, _NOISY_RIM_BIAS = 90.0, 1.0
-"""With noise, the rim's height is estimated by a percentile of the heights around the place, about
-two thirds of which belong to the rim. The numbers are this percentile, and the estimate's bias in
-standard deviations of the noise."""
+"""With noise, the rim's height is estimated by a percentile of the heights around the place. About
+two thirds of these heights belong to the rim. The numbers are the percentile, and the estimate's
+bias in standard deviations of the noise."""
 _NOISY_FLOOR_SHARE, _NOISY_FLOOR_BIAS = 25.0, -0.67
 """The percentile and the bias for the floor's height, which is estimated from the heights at the
 place."""

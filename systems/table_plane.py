@@ -16,8 +16,8 @@ _BIN = 0.001
 _FAR = 0.03
 """The table is sought within this distance of the bottom of the grid, in metres."""
 _BAND = 0.004
-"""A pixel belongs to a plane if it is within this distance, in metres, or within three times the
-noise if that is more."""
+"""A pixel belongs to a plane if its distance from it is less than this, in metres, or less than
+three times the noise."""
 _FITS = 8
 """Number of fits of the plane. The first half use ever more pixels, the second half only those
 nearest to the plane."""

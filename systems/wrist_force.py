@@ -95,7 +95,7 @@ class WristForce(LeafSystem):
         output.SetFromVector([moment @ jaws])
 
     def _spatial_force(self, context: Context) -> NDArray[np.float64]:
-        """(6) F: moment, then force; sets the positions in the scratch context."""
+        """The spatial force F (6): moment, then force. Sets the scratch context's positions."""
         torque = self._torque.Eval(context)
         if self._noise > 0:
             # The time in microseconds identifies the step, and so seeds its noise.

@@ -350,7 +350,7 @@ class _OfObservationAlone:
 
     function: Callable[[Observation], PickPlaceAction]
     forgets: bool = False
-    """Whether the observation's `history` is emptied before the call."""
+    """Whether the function gets the observation without its `history`."""
 
     def __call__(
         self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()

@@ -275,7 +275,7 @@ def test_folders_without_demonstrations_are_refused(tmp_path: Path):
 def test_calibrations_are_compared_by_value(tmp_path: Path):
     write_calibration(tmp_path / "same.yaml", BENCH)
     assert calibration_digest(read_calibration(tmp_path / "same.yaml")) == calibration_digest(BENCH)
-    # The same pose, written as another kind of rotation, differs by rounding.
+    # If the same rotation is given in another form, the pose differs by rounding.
     other = with_poses(BENCH, {camera.name: camera.X_BC - 1e-15 for camera in BENCH.cameras})
     assert calibration_digest(other) == calibration_digest(BENCH)
     moved = with_poses(BENCH, {camera.name: camera.X_BC + 1e-5 for camera in BENCH.cameras})

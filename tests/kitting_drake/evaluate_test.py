@@ -224,7 +224,8 @@ def test_evaluates_if_any_seed_can_be_built(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_missing_rendering_is_not_a_failed_episode(monkeypatch: pytest.MonkeyPatch):
-    """Missing rendering is an error, because a failed episode would never be run again."""
+    """Missing rendering must raise an error: a failed episode would count as done, and never be run
+    again."""
     monkeypatch.setattr(cameras, "can_render", lambda: False)
     looks = PythonPolicy(function="systems.signals:PickPlaceAction")
     chosen = dataclasses.replace(CHOSEN, scenario=Scenario(policy=looks))

@@ -149,7 +149,7 @@ def test_heightmap_shows_the_box_at_its_true_pose(scene, xy, yaw_deg):
     # An error of one pixel over the box's length would be 1.8 degrees.
     assert abs(math.remainder(angle - yaw_deg, 180)) < 1.5
 
-    # Shading scales a colour but keeps its hue. At outlines the renderer blends both colours.
+    # Shading keeps a colour's hue. At the box's outline, the colours of box and table are mixed.
     blank = np.all(observation.image == 0, axis=0)
     for cells, color in ((inside, BOX_COLOR), (apart, TABLE_COLOR)):
         seen = observation.rgb[:, cells & ~blank]

@@ -67,7 +67,7 @@ def test_a_stage_that_was_complete_when_an_action_began_is_kept():
         return system.GetOutputPort("kept_goals").Eval(context).tolist()
 
     assert advance(Mode.OBSERVE, first, away) == [0.0, 0.0]
-    # Only a stage that is complete when an action begins is kept.
+    # To be kept, a stage must be complete at the moment when an action begins.
     assert advance(Mode.APPROACH, away, away) == [0.0, 0.0]
     assert advance(Mode.CARRY, first, away) == [0.0, 0.0]
     assert advance(Mode.OBSERVE, first, away) == [0.0, 0.0]

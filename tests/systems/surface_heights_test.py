@@ -10,7 +10,7 @@ PICK, PLACE = PlanarPose(0.40, 0.20), PlanarPose(0.60, -0.20)
 
 
 def observation(*boxes: tuple[PlanarPose, float, float]) -> Observation:
-    """An observation of boxes. Each has a middle, half a side, and its top's height above z = 0."""
+    """An observation of square boxes, given by (middle, half a side, world z of the top)."""
     image = np.full((4, *GRID.shape), 0.5, np.float32)
     image[3] = -GRID.z_min
     for middle, half, height in boxes:

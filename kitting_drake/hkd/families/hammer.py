@@ -51,7 +51,7 @@ class HammerParameters:
     throat_width_mm: float = 23.0
     swell_width_mm: float = 34.0
     handle_flatness: float = 0.76
-    # Materials of the parts, keys of solids.MATERIALS.
+    # The materials of the parts. Each is a key of solids.MATERIALS.
     head_material: str = "steel"
     face_material: str = "polished_steel"
     handle_material: str = "hickory"

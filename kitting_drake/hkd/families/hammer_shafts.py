@@ -45,7 +45,7 @@ class Shaft:
     ribs: int = 7
     # Whether the broad sides of the neck have hollows, as on some steel handles.
     fullered: bool = False
-    # Materials of the parts, keys of solids.MATERIALS.
+    # The materials of the parts. Each is a key of solids.MATERIALS.
     material: str = "hickory"
     grip_material: str = "hickory"
     accent_material: str = "dark_steel"

@@ -55,7 +55,7 @@ class PliersParameters:
     # The diameter of the rivet, and the bevel of the steel's outer edges.
     rivet_diameter_mm: float = 13.0
     bevel_mm: float = 0.9
-    # Materials of the parts, keys of solids.MATERIALS.
+    # The materials of the parts. Each is a key of solids.MATERIALS.
     steel_material: str = "steel"
     rivet_material: str = "polished_steel"
     grip_material: str = "red_grip"

@@ -62,7 +62,7 @@ class Levers:
     # The number of curved grooves in the joint, and whether there is a leaf spring.
     grooves: int = 0
     spring: bool = False
-    # Materials of the parts, keys of solids.MATERIALS.
+    # The materials of the parts. Each is a key of solids.MATERIALS.
     steel_material: str = "steel"
     rivet_material: str = "polished_steel"
     grip_material: str = "red_grip"
@@ -200,7 +200,7 @@ def _edge_bevel(v: Levers, j: Jaws) -> Manifold:
     wide = {"diagonal": 0.30 * v.joint_width_mm, "snips": 4.0, "nipper": 5.0}[j.kind]
     start = v.joint_front_mm + (8.0 if j.kind != "nipper" else 0.0)
     if j.kind == "nipper":
-        # The cutting edge runs across the tool, so bevel its front.
+        # A nipper cuts with its front edge, which runs across the tool: bevel this edge.
         flat = [(length - 5.0, z + 0.1), (length + 5.0, z + 0.1), (length + 5.0, -0.2 * z)]
         rings = [np.array([(x, y, h) for x, h in flat]) for y in (-40.0, 40.0)]
     else:

@@ -51,7 +51,7 @@ class ScrewdriverParameters:
     # it leaves bare.
     sleeve_diameter_mm: float = 0.0
     bare_mm: float = 25.0
-    # Materials of the parts, keys of solids.MATERIALS.
+    # The materials of the parts. Each is a key of solids.MATERIALS.
     handle_material: str = "red_grip"
     accent_material: str = "black_rubber"
     shaft_material: str = "polished_steel"

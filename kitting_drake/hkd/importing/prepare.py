@@ -31,8 +31,8 @@ from kitting_drake.hkd.tools.sdf import tool_sdf
 from kitting_drake.hkd.tools.symmetry import symmetry_order
 from kitting_drake.hkd.tools.tool import Tool, load_tool
 
-# If a dropped tool comes to rest tilted by more than `_SAME_POSE_DEG`, it is moved to that pose and
-# dropped again. It is dropped at most `_LAYINGS` times in all.
+# If a dropped tool comes to rest tilted by more than `_SAME_POSE_DEG`, its model is rotated by this
+# tilt and dropped again. A tool is dropped at most `_LAYINGS` times in all.
 _SAME_POSE_DEG, _LAYINGS = 2.0, 3
 # A tool made from an outline must not tip over on a table with this tilt, in degrees.
 _TIPS_DEG = 10.0

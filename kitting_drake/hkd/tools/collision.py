@@ -48,7 +48,7 @@ def closed(profile: CrossSection, clearance: float) -> CrossSection:
 def furthest(
     inner: CrossSection, outer: CrossSection, precision: float = 0.01, area: float = _AREA
 ) -> float:
-    """Returns the largest distance of a point of `inner` from `outer` in mm, but at most 5.
+    """Returns the largest distance of a point of `inner` from `outer`, in mm; 5 if it is larger.
 
     Args:
         inner, outer: two regions, in mm.

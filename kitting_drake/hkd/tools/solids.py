@@ -219,7 +219,7 @@ def _bevelled(profile: CrossSection, z_low: float, z_high: float, bevel: float) 
     inner = profile.offset(-bevel, JoinType.Miter).to_polygons()
     rim, top = np.vstack(outer), np.vstack(inner)
     strip = manifold3d.triangulate([*outer, *(loop[::-1] for loop in inner)])
-    # The strip was made from reversed inner loops: number their vertices as in the cap instead.
+    # The strip's inner loops are reversed. Give their vertices the numbers that they have in `top`.
     numbers = np.arange(len(top))
     starts = np.cumsum([len(loop) for loop in inner])[:-1]
     backward = np.concatenate([n[::-1] for n in np.split(numbers, starts)])

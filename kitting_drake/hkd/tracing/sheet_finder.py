@@ -239,10 +239,14 @@ def _edge(
 
 
 def _robust_line(shares: Array, offsets: Array) -> tuple[Array, Array]:
-    """Fits a line to points (share of a segment, offset from it), and ignores outliers.
+    """Fits a line to points near a segment, and ignores outliers.
+
+    Args:
+        shares: (n) each point's position along the segment, from 0 at its start to 1 at its end.
+        offsets: (n) each point's offset from the segment.
 
     Returns:
-        The line's offset at share 0 and its slope; and a mask (n) of the points close to it.
+        The line's offset at share 0 and its slope; and a mask (n) of the points close to the line.
     """
     rng = np.random.default_rng(0)
     design = np.c_[np.ones_like(shares), shares]

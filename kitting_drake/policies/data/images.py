@@ -50,7 +50,7 @@ class LabelledImage:
     pick_theta: float
     """The gripper's angle in radians; adding pi gives the same grasp."""
     place: NDArray[np.float64]
-    """(row, col) where the object's point under the pick is to go."""
+    """(row, col) of the place: the object's point at `pick` moves there."""
     rotation: float
     """The rotation of the object between pick and place, in radians."""
     other_picks: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2)))

@@ -37,5 +37,5 @@ def _mean_and_std(moments: NDArray[np.float64]) -> tuple[float, float]:
     """
     mean, square = moments.mean(axis=1)
     variance = float(square) - float(mean) ** 2
-    # For constant values rounding errors may give a tiny or negative variance.
+    # If all values are equal, rounding errors may make the variance slightly positive or negative.
     return float(mean), math.sqrt(variance) if variance > 1e-12 else 0.0

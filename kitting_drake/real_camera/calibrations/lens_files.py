@@ -220,7 +220,7 @@ def _librealsense(model: str, values: list[Any], where: str) -> dict[str, Any]:
 
 
 def check_lens(lens: dict[str, Any], path: Path) -> None:
-    """Raises UserError if a mapping from a file has no intrinsics."""
+    """Raises UserError if the content of a lens file has no intrinsics."""
     if not has_intrinsics(lens):
         raise UserError(
             f"{path} has neither camera_matrix nor k: it must be a CameraInfo, a calibration of "

@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 
 _LEAST_POINTS = 500
 _SHARED = 100
-"""Two cameras are compared if both see at least this number of pixels of o_t."""
+"""Two cameras are compared if they have at least this number of pixels of o_t in common."""
 
 
 @dataclass(frozen=True)
@@ -45,8 +45,8 @@ class TableCheck:
     noise: float
     """A robust estimate of the standard deviation of the heights, in metres."""
     holes: float
-    """The share without measured depth, from 0 to 1: for one camera, of the part of the table in
-    its view; for o_t, of the whole table."""
+    """The share of the table without measured depth, from 0 to 1. For one camera, only the part of
+    the table in its view counts."""
 
     @property
     def tilt_angle(self) -> float:

@@ -153,9 +153,10 @@ def _frame(
 
 
 def _grouped(files: Sequence[Path]) -> Iterator[_Sources]:
-    """Yields the files of each camera: one that holds colour and depth, or (colour, depth).
+    """Yields the files of each camera: (file,) if one file holds colour and depth, else (colour,
+    depth).
 
-    The two files of such a pair may be given in either order.
+    The two files of a pair may be given in either order.
     """
     for path in files:
         _check_ending(path)

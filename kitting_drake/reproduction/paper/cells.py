@@ -1,4 +1,4 @@
-"""The cells of the paper's tables: their trainings and evaluations, and which summaries fit."""
+"""The cells of the paper's tables: how each is trained and evaluated, and which results fit it."""
 
 from __future__ import annotations
 

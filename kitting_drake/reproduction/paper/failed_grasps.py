@@ -123,7 +123,7 @@ def failed_grasps(results: Sequence[Result]) -> list[str]:
 
 
 def is_as_in_the_paper(result: Result) -> bool:
-    """Whether a result is of a learned policy as in the paper: with quantized actions, in episodes
-    that end at success."""
+    """Whether a result comes from a learned policy under the paper's conditions: actions are
+    quantized, and episodes end at success."""
     cell = result.cell
     return isinstance(cell.policy, Training) and cell.end_at_success and not cell.continuous

@@ -111,8 +111,8 @@ def draw_table_1(results: Mapping[str, Result]) -> bytes:
     """Draws the mean reward of each Ravens task over the number of demonstrations, as a PNG.
 
     A filled marker is our result with its 95 % interval. A star is our result with extensions. A
-    hollow marker is the paper's figure for the same cell. A cell without a run is left out, and
-    so is the paper's figure for it. A task without a run has no panel.
+    hollow marker is the paper's result for the same cell. A cell without a run is left out,
+    with the paper's result for it. A task without a run has no panel.
 
     Args:
         results: the results by cell name.
@@ -157,7 +157,7 @@ def draw_table_1(results: Mapping[str, Result]) -> bytes:
 
 
 def _draw_task(axis: Axes, task: str, column: int, results: Mapping[str, Result]) -> None:
-    """Draws the panel of a task: our cells, and the paper's figures for our cells without
+    """Draws the panel of a task: our results, and the paper's results for our cells without
     extensions."""
     for index, ((method, n), (colour, marker)) in enumerate(_ROWS.items()):
         for place, count in enumerate(sorted(RAVENS_DEMONSTRATIONS)):

@@ -267,7 +267,7 @@ class Queue:
 
 
 def _is_rate_chosen(training: Training) -> bool:
-    """Whether the learning rate of a training is chosen by its `reference`."""
+    """Whether a training uses the learning rate that is best for its `reference`."""
     return training.learning_rate is None and training.method != "so2"
 
 
@@ -311,7 +311,8 @@ def run_paper(queue: Queue, cells: Sequence[Cell]) -> dict[str, str]:
     Raises:
         UserError: a result does not fit its cell.
     """
-    # Terminate the command, which would otherwise lock its folder against the next queue.
+    # Exit on these signals. The exit also ends the running command, which would otherwise keep its
+    # folder locked against the next queue.
     ended_by = (signal.SIGTERM, signal.SIGHUP)
     before = [signal.signal(number, lambda came, _: sys.exit(128 + came)) for number in ended_by]
     try:

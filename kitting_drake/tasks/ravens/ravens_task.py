@@ -18,8 +18,8 @@ TOPPLED = "toppled"
 PREREQUISITE_MISSING = "prerequisite missing"
 
 _GRASP_STREAM = 2
-"""The demonstrator's grasps have a random stream with this number, so that other draws do not
-depend on them."""
+"""The number of the random stream for the demonstrator's grasps. They have their own stream, so
+that other draws do not depend on them."""
 
 _UPRIGHT = math.cos(math.radians(20.0))
 """Cosine of the tilt above which an object counts as toppled."""

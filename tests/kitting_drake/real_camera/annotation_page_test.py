@@ -133,7 +133,8 @@ def test_invalid_actions_are_rejected(
 
 
 def test_other_origins_are_rejected(server: AnnotationServer, folder: Path):
-    """Other sites can make a browser send plain text here, or let their host name point here."""
+    """A web page of another site can make a browser send plain text to this server. The site's host
+    name can also be made to point to this server."""
     assert post(server, "steps/0", POSES, "text/plain")[0] == 403
     connection = http.client.HTTPConnection(*server.server_address)
     connection.request("GET", "/steps", headers={"Host": "elsewhere.example:80"})

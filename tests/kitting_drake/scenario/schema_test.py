@@ -48,7 +48,7 @@ def agrees(raw: Any, described: Any) -> bool:
     """Whether the description of a Drake config contains all values of the YAML."""
     if not isinstance(raw, dict):
         return bool(raw == described)
-    # A rotation's only field is `value`. YAML gives its content without this name.
+    # YAML gives a rotation without the name of its only field, `value`.
     inner = described if raw.keys() <= described.keys() else described["value"]
     return all(agrees(value, inner[name]) for name, value in raw.items())
 

@@ -38,7 +38,7 @@ _FOOT, _FOOT_SIDE, _OFF_THE_MIDDLE = 3.0, 8.0, 2.0
 """Additional costs of a cut per mm of its length: through a foot; along a foot's side; and, between
 two feet, per mm of the cut's distance from the middle."""
 _ROOMY = 4.0
-"""The distance from cavities that cuts keep where possible, in mm."""
+"""Where possible, cuts stay at least this far from cavities, in mm."""
 _STEEPEST = 4
 """The largest sideways step of a cut for each step forward, in cells."""
 _UPRIGHT_ENDS = 6.0

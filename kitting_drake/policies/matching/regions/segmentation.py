@@ -276,8 +276,10 @@ def _noise_of(
 
 
 def _noise(relief: NDArray[np.floating]) -> float:
-    """Returns a robust estimate of the standard deviation of heights, in metres, from their
-    distances to a plane on which most of them lie."""
+    """Returns a robust estimate of the standard deviation of heights, in metres.
+
+    `relief` holds the distances of the heights from a plane. Most of them lie on this plane.
+    """
     flat = np.abs(relief[np.abs(relief) < 3 * PLANE_BAND])
     return 1.4826 * float(np.median(flat)) if flat.size else 0.0
 

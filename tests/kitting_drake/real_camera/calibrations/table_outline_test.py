@@ -1,4 +1,4 @@
-"""The table's outline: it is read, written, and used by o_t and by the checks."""
+"""Tests the table's outline: its reading and writing, and its effect on o_t and on the checks."""
 
 import dataclasses
 from pathlib import Path

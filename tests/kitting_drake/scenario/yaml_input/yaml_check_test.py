@@ -32,7 +32,7 @@ class Box:
     "value",
     [
         {},
-        {"count": 3, "path": "a/b", "lid": {"radius": 2}},  # A float may be written as 2.
+        {"count": 3, "path": "a/b", "lid": {"radius": 2}},  # An integer counts as a float.
         {"lid": {"_tag": "!Square", "side": 2.0, "label": None}},
         {"bottoms": [{"_tag": "!Square", "side": 2.0}, {"radius": 1.0}]},
         {"by_name": {"a": {"label": "x"}}, "note": None},

@@ -193,7 +193,8 @@ def test_the_smallest_gap_is_told_with_its_place(tmp_path: Path):
 
 
 def box(path: Path, scale: float, measurement: int | None = None) -> Path:
-    """A box of 160 x 20 mm, as R12 without $INSUNITS; its long sides are two overlapping lines."""
+    """Writes a box of 160 x 20 mm as DXF R12 without $INSUNITS. Each long side consists of two
+    overlapping lines."""
     header = "" if measurement is None else f"9\n$MEASUREMENT\n70\n{measurement}\n"
     text = f"0\nSECTION\n2\nHEADER\n{header}0\nENDSEC\n" if header else ""
     lines = [(0, 0, 0, 20), (160, 0, 160, 20)]

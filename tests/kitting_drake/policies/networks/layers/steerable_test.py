@@ -27,7 +27,7 @@ def random_features(*shape: int) -> Tensor:
 
 
 def rotate_by_90(features: Tensor) -> Tensor:
-    """Moves the pixels of a feature image by 90 degrees, but does not transform their fields."""
+    """Rotates the grid of pixels by 90 degrees, but does not transform the fields in the pixels."""
     return features.rot90(1, (2, 3))
 
 
