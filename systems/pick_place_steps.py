@@ -30,7 +30,8 @@ _STEADY = 0.6
 """An object has turned if its lever (see `felt_lever`) falls below this fraction of its earlier
 value."""
 _STUCK = 0.004
-"""Jaws that have opened by this much less than commanded, in m, stick to the object."""
+"""If the opening of the jaws stays below its goal by more than this, in m, they stick to the
+object."""
 _PUSH = 1 / 3
 """Jaws that stick are opened with this share of the grasp force, in addition to the force by which
 they follow their command."""

@@ -36,9 +36,9 @@ _GLARE, _GLARE_SPREADS = 0.025, 5.0
 """The least brightness of glare above the ground: in logarithms of light, and in standard
 deviations of the ground's light. The larger one counts."""
 _GLARE_REACH_MM, _GLARE_GAP_MM, _GLARE_MM2, _GLARE_SHARE = 8.0, 2.5, 0.7, 0.25
-"""Glare up to `_GLARE_REACH_MM` from a tool is added to it, with the strip between them if that is
-narrower than twice `_GLARE_GAP_MM`. An added region has an area of at least `_GLARE_MM2`, of which
-at least the share `_GLARE_SHARE` is brighter than the ground."""
+"""Glare up to `_GLARE_REACH_MM` from a tool is added to the tool. A strip between the two is added
+if it is narrower than twice `_GLARE_GAP_MM`. An added region has an area of at least `_GLARE_MM2`,
+of which at least the share `_GLARE_SHARE` is brighter than the ground."""
 _BAY_MM = 12.0
 """Bays and holes may be reflections if they are at most twice this wide, in mm."""
 _BLENDED_MM, _SHADED = 1.2, 0.06

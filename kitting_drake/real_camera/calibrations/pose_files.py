@@ -29,7 +29,7 @@ from kitting_drake.real_camera.calibrations.yaml_values import (
 Array = NDArray[np.float64]
 
 _ROUNDED = 2e-3
-"""The tolerance for a quaternion of tf2_echo, which prints three decimals."""
+"""The tolerance for the length of a quaternion that tf2_echo printed with three decimals."""
 _STILL = 2e-3
 """The largest difference between the poses that tf2_echo prints repeatedly for a frame at rest. It
 holds for positions in metres and for the numbers of a quaternion."""
