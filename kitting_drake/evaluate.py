@@ -155,7 +155,7 @@ def evaluate(
     with counting_bar(console, "episodes") as progress:
         task = progress.add_task("", total=len(seeds), completed=len(seeds) - len(pending))
         for episode in side_by_side(run, lambda: next(queue, None), workers=workers):
-            # Keep the commit of an episode from a worker that has its own checkout.
+            # Keep a commit that the worker recorded: the worker may have its own checkout.
             episode["commit"] = episode.get("commit") or now
             done[episode["seed"]] = episode
             append_line(path, episode)

@@ -96,8 +96,8 @@ def _settings(
         learning_rate=arguments.learning_rate,
         decay=arguments.decay,
         taken_only=arguments.taken_only or not assumed.later_picks_possible,
-        # Curvature augmentation bends crops. The Transporter rotates whole images, so it is
-        # trained without.
+        # Curvature augmentation bends crops, so it does not suit the Transporter, which rotates
+        # whole images.
         rigid=arguments.rigid or not assumed.curvature or arguments.method == "transporter",
         reflection=assumed.reflection and not arguments.rigid,
         colour=learned.colour if begun is None else begun.colour,

@@ -1,5 +1,5 @@
-"""Plans one motion of a Franka arm, which is called a way here. The arm first brakes to a stop,
-then follows a path."""
+"""Plans a *way*, which is one motion of a Franka arm: the arm first brakes to a stop, then follows
+a path."""
 
 from __future__ import annotations
 

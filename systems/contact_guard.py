@@ -132,7 +132,8 @@ class ContactGuard:
 
     def tare(self, state: PlannerState, contact: NDArray[np.float64], threshold: float) -> None:
         """Sets the payload to the vertical force at rest. If this force differs too much from the
-        weighed payload, something else touches the hand or the object, and the payload stays.
+        weighed payload, something else touches the hand or the object, and the payload stays as
+        weighed.
 
         Args:
             state: the planner's state, at the end of `CARRY`.

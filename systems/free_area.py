@@ -20,8 +20,8 @@ _LEAST = 0.010
 _AMPLE = 0.060
 """Clearance beyond this, in metres, has no benefit: the open hand already has room."""
 _WAY = 0.02
-"""The additional clearance, in metres, that outweighs one metre more of distance from the wanted
-point."""
+"""Each metre of distance from the wanted point counts as much as this loss of clearance, in
+metres."""
 
 
 def find_free_pose(

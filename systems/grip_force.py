@@ -21,8 +21,8 @@ than this, in N m."""
 _NOTABLE_MOMENT = 0.10
 """A moment that a poor grip might not hold, in N m."""
 _INDULGENCE = 0.5
-"""Each time an object was set down again, the allowed moment grows by this fraction of its first
-value."""
+"""Each time an object is set down because it turned, the allowed moment grows by this fraction of
+the initial limit."""
 _LONGEST_LEVER = 0.12
 """Largest plausible distance of a centre of mass from the pads' middle, in m."""
 _SOFT, _SOFT_SHARE = 0.006, 0.2

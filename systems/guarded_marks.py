@@ -25,7 +25,7 @@ def guarded_marks(
         # Contact is expected only if the hand presses; on the way to a grasp the jaws should touch
         # nothing.
         return first, state.pick_top_z + margin if state.press else state.grasp_z
-    # Either the object first touches the floor of its place, or the fingertips first touch the rim
-    # beside it.
+    # The first contact is either that of the object with the floor of its place, or that of the
+    # fingertips with the rim beside it. Use the higher one.
     hanging = state.hold_z - state.support_z
     return first, max(state.floor_z + hanging, state.rim_z + state.doubt) + margin

@@ -80,7 +80,8 @@ def fastest_times(
 
 
 def _solvable(b: NDArray[np.float64], k: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(n) the largest x at each point for which some u satisfies |u + k x| <= b in all rows."""
+    """(n) at each point, the largest x for which one u meets the limits |u + k x| <= b of all
+    rows."""
     gap = k[:, :, None] - k[:, None, :]
     room = b[:, :, None] + b[:, None, :]
     with np.errstate(divide="ignore", invalid="ignore"):

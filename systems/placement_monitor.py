@@ -51,7 +51,7 @@ class PlacementMonitor(LeafSystem):
     - `mode` (1): the planner's port of that name. If it is not connected, no goal is kept.
     - `placements` (abstract, list of n `Placement`): one for each object, by the law of
       `evaluate_placements`.
-    - `reward` (1): the sum of the goals' rewards, each multiplied by its earned share.
+    - `reward` (1): the episode's present score, 0 to 1 (see `total_reward`).
     - `success` (n): 1 for an object that fills its goal, else 0.
     - `add_s` (n): ADD-S, equation 9 of the paper, in metres; infinite for an object without a goal.
     - `position_error`, `angle_error`, `height_error` (n): see `Placement`; metres, radians.

@@ -136,10 +136,11 @@ def _onto(raw: dict, defaults: Scenario) -> tuple[dict, Scenario]:
 
 
 def _without_mappings(given: dict, current: Task) -> Task:
-    """Returns the task over which `given` is merged.
+    """Returns the task onto which `given` is merged.
 
-    This is `current` if `given` has its type. Otherwise it is the default task of the given type,
-    with empty mappings in place of those that `given` replaces.
+    If `given` has the type of `current`, this is `current`. Otherwise it is the default task of
+    the given type. The mappings of this task that `given` also has are emptied, so that `given`
+    replaces them.
     """
     for variant in typing.get_args(Task):
         if variant is PythonTask:

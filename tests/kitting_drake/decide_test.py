@@ -212,7 +212,7 @@ def command(bench: Path, *flags: object) -> subprocess.CompletedProcess[str]:
 
 
 def run_without_drake(*arguments: object) -> subprocess.CompletedProcess[str]:
-    """Runs `decide` in a process without Drake, which says whether it loaded torch."""
+    """Runs `decide` in a process without Drake. Stderr ends with whether torch was loaded."""
     return subprocess.run(
         [sys.executable, "-c", _NO_DRAKE, *map(str, arguments)],
         cwd=ROOT,

@@ -93,7 +93,7 @@ def page(folder: Path) -> str:
 
 
 def tables(page: str) -> dict[str, list[list[list[str]]]]:
-    """The tables below each heading, as lists of rows of cells, without the rules."""
+    """The tables below each heading, as lists of rows of cells, without the lines of dashes."""
     found: dict[str, list[list[list[str]]]] = {}
     heading, before = "", ""
     for line in page.splitlines():

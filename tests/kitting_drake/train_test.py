@@ -129,7 +129,8 @@ def test_writes_weights_and_their_card(trained: Path):
     assert file.card["demonstrations"] == 3
     assert file.card["demonstration_seeds"] == [10, 11, 12]
     assert file.card["validation_seeds"] == [13]
-    # Each demonstration has three samples: both objects are valid picks in its first observation.
+    # Each demonstration has three samples: two from its first observation, in which both objects
+    # are valid picks, and one from its second.
     assert file.card["samples"] == 3 * 3
     assert file.card["final_observations"] == 3
     assert not (file.card["taken_only"] or file.card["rigid"])

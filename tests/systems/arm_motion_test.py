@@ -102,7 +102,8 @@ def check_random_ways(model: str, actions: int, seed: int) -> int:
             time += lasts
             at_rest = motion.motion_at(state, time)
             np.testing.assert_allclose(at_rest[7:], 0.0, atol=1e-12)
-    # Motions do not begin at whole milliseconds, so check the limits in each by itself.
+    # Samples are 1 ms apart within a motion, but not from one motion to the next. So check each
+    # motion separately.
     for part in samples:
         if len(part) > 2:
             check_limits(limits, part, inertia)

@@ -136,7 +136,7 @@ def test_pixels_at_grazing_angles_are_holes(normal: tuple[float, float, float]):
 
 def test_holes_of_a_frontal_wall_are_symmetric():
     depth = np.full((HEIGHT, WIDTH), 0.7, np.float32)
-    # Near the image's corners, only some of the rays are steeper than this.
+    # Only rays near the image's corners make a larger angle than this with the wall's normal.
     noise = SensorNoiseParameters(steepest_deg=36.0)
     holes = noisy_depth(depth, noise, INFO, np.random.default_rng(0)) == 0
     assert 0 < holes.mean() < 0.5

@@ -68,7 +68,7 @@ def _prismatic(outline: CrossSection) -> Callable[[float, float, float, float, f
             [(0.2 * length, diameter), (0.0, min(reach, diameter))],
         )
         prism = tip.extrude(length, 0, 0.0, (1.0, 1.0)).rotate((0.0, 90.0, 0.0))
-        # Rotate the hull like the section, whose x has become -z.
+        # Rotate the hull as the prism was rotated: x of the section has become -z.
         hull = CrossSection.hull_points(points).to_polygons()[0][:, ::-1] * (1.0, -1.0)
         ends = np.vstack([across_x(hull, end - length), across_x(hull, end)])
         return Shape(blade.solid + prism.translate((end - length, 0.0, 0.0)), [*blade.hulls, ends])

@@ -37,7 +37,8 @@ FINGER_COLUMNS = round(FINGER_LENGTH / 2 / BIN)
 
 @dataclass(frozen=True)
 class Reach:
-    """The extents of a tool to the left and right at each height, for one rotation of the hand."""
+    """The extents of a tool to the left (+v) and right (-v) at each height, for one rotation of the
+    hand."""
 
     u_min: float
     """The u of the first column; each column is `BIN` long."""

@@ -60,7 +60,7 @@ class GraspProposal(Grasp):
     contact: float
     """The share of the pads' length, 0 to 1, along which both pads touch."""
     depth: float
-    """The height over which the pads touch, on average, as a share of the grasp depth, 0 to 1."""
+    """The mean vertical extent of the pads' contact, as a share of the grasp depth, 0 to 1."""
     slope: float
     """The inward lean of the gripped faces at the pads' lower edges, in radians."""
     overhang: float

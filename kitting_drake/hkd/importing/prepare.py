@@ -147,7 +147,7 @@ def _surface(request: ImportRequest) -> tuple[np.ndarray, np.ndarray, list[str]]
 
     Returns:
         Vertices (n, 3), triangles (m, 3) and notes. The vertices of a mesh are in its own units,
-        those of an outline in mm. The first note on an outline says what gives its scale.
+        those of an outline in mm. For an outline, the first note says how its scale is known.
     """
     if not is_outline(request.mesh):
         return *read_mesh(request.mesh), []

@@ -280,7 +280,7 @@ def _wrapped(triangles: Array) -> Manifold:
     if filled.sum() < 1.05 * surface:
         return Manifold()
     distance = ndimage.distance_transform_edt(filled) - ndimage.distance_transform_edt(~filled)
-    # Subtract the half voxel by which the surface's voxels extend beyond it.
+    # Subtract half a voxel: the voxels on the surface extend that far beyond it.
     field = ndimage.gaussian_filter(distance, 0.7) - 0.5
     inside = np.argwhere(field > -3)
     first, last = inside.min(axis=0), inside.max(axis=0)

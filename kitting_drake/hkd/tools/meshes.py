@@ -55,7 +55,7 @@ def write_smooth_obj(path: Path, solid: Manifold, crease_angle_deg: float) -> in
 def flat_obj(
     vertices: np.ndarray, faces: np.ndarray, *, digits: int, normal_digits: int | None = None
 ) -> str:
-    """Returns the OBJ text of a mesh, with one normal per face on request.
+    """Returns the OBJ text of a mesh, with or without one normal per face.
 
     Args:
         vertices: the vertices (n, 3), in metres.

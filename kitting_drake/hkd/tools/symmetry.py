@@ -154,8 +154,8 @@ def _surface_distance(
             distances[far], _ = coarse_tree.query(places[far])
         return float(distances.mean())
 
-    # Average two directions: from the copy to the original, and from the original to the copy. For
-    # a half turn they are equal.
+    # Average the distance from the copy to the original and that from the original to the copy. For
+    # a half turn the two distances are equal.
     def mean_distance(shift: Shift) -> float:
         offset = np.append(shift, 0.0)
         there = mean_to_surface(points @ R.T + offset)

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 _OUTLINE_ERROR_MM = 0.8
 """`Tool.outline_error` of a traced tool, in mm.
 
-If the trace reports no doubtful place, the real tool extends almost nowhere beyond its outline by
-more than this. `hkd kit` adds this distance to small clearances.
+If the trace reports no doubtful place, the real tool extends beyond the traced outline by at most
+this, almost everywhere. `hkd kit` adds this distance to small clearances.
 """
 
 

@@ -21,7 +21,7 @@ _ROUGH = 0.022
 _MOST_FINE = 0.1
 _HOLE_BALL_MM = 0.6
 _STRIP_MM = 1.2
-"""An eroded region in `_shaded_holes` is a strip if it is at most twice this wide, in mm."""
+"""Half the largest width of a strip, in mm. Strips are eroded regions in `_shaded_holes`."""
 _EDGE_MM = 2.3
 """The distance by which the ground is extended over the rough pixels at an edge, in mm."""
 _SHINE_STEEP = 0.6
@@ -40,7 +40,7 @@ _GLARE_REACH_MM, _GLARE_GAP_MM, _GLARE_MM2, _GLARE_SHARE = 8.0, 2.5, 0.7, 0.25
 if it is narrower than twice `_GLARE_GAP_MM`. An added region has an area of at least `_GLARE_MM2`,
 of which at least the share `_GLARE_SHARE` is brighter than the ground."""
 _BAY_MM = 12.0
-"""Bays and holes may be reflections if they are at most twice this wide, in mm."""
+"""Half the largest width of a bay or hole that may be a reflection, in mm."""
 _BLENDED_MM, _SHADED = 1.2, 0.06
 """A tool blends into a shadow where the brightness step is wider than `_BLENDED_MM` and the shadow
 is darker than `_SHADED`, in logarithms of light."""

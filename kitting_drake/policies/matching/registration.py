@@ -1,4 +1,4 @@
-"""Registers an object's outline to that of a recess, to less than a pixel.
+"""Registers an object's outline to a recess's outline, with an error of less than a pixel.
 
 Each outline is stored as signed distances on a grid that is finer than that of o_t. A recess has
 the outline of its object, but without narrow notches, and wider by a clearance (see

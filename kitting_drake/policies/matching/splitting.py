@@ -46,7 +46,7 @@ _NEAR = 0.0025
 """A point of an object's outline counts as shared if its distance from the region's outline, in
 metres, is less than this."""
 _SHARED = 0.45
-"""The least share of an object's outline that must be shared with the region's outline."""
+"""The least fraction of an object's outline points that must be shared (see `_NEAR`)."""
 _COST = 0.0010
 """The largest mean distance, in metres, of an outline's shared points from the region's outline."""
 _UNEXPLAINED = 0.15
@@ -68,7 +68,7 @@ _SLIVER = 1
 """After objects are cut out of a region, the remainder is eroded by this many pixels, to drop
 slivers."""
 _LEAST_REST = 0.0002
-"""A part of this remainder is an object if its area is at least this, in square metres."""
+"""A connected part of the remainder is an object if its area is at least this, in square metres."""
 
 
 @dataclass(frozen=True)

@@ -40,10 +40,11 @@ _FARTHEST = 0.35
 _LEAST = 150
 """The least number of used pixels on a plane."""
 _BELOW = 0.5
-"""The plane at the calibrated height must have at least this fraction of the pixels of any plane
-below it. Otherwise the plane with the most pixels counts as the table."""
+"""The plane at the calibrated height counts as the table if it has enough pixels: at least this
+fraction of those of every plane below it. Otherwise the plane with the most pixels counts."""
 _ABOVE = 0.08
-"""The same fraction for planes above it. It is small, because objects may hide most of a table."""
+"""The same fraction for every plane above it. It is small, because objects may hide most of a
+table."""
 _CURVED = 0.5
 """The depths are probably distances from the camera if conversion from distances to depths reduces
 the table's noise to less than this fraction."""
@@ -172,8 +173,8 @@ def _points(
 def _is_range(
     camera: BenchCamera, depth: NDArray[np.float32], calibration: Calibration, fit: TableFit
 ) -> bool:
-    """Whether the depths seem to be distances from the camera. Converted to depths along the
-    optical axis, they then show a much flatter table."""
+    """Whether the depths are probably distances from the camera: converting them to depths along
+    the optical axis makes the table much flatter."""
     if fit.plane.noise < _FLAT:
         return False
     points = _points(camera, camera.X_BC, _as_depth(camera, depth), calibration)

@@ -38,7 +38,7 @@ def measure_traced_kits(
     kits: int, seed: int, fit: str, folder: Path, console: Console
 ) -> dict[str, Any]:
     """Makes kits of four tools from traced photos, and lets the oracle fill them with the true
-    tools, with one try for each. Skips the kits that are in the folder already.
+    tools, with one try for each tool. Skips the kits that are in the folder already.
 
     The photos are rendered as for `benchmark trace`, with each tool's own height. If the tracer
     refuses a photo or doubts its outline, another photo is taken, as `hkd trace` asks.

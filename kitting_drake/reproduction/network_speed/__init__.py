@@ -1,7 +1,7 @@
 """Measures the cost of the networks on this machine: figure 6(c) of the paper, and related numbers.
 
-All numbers come from one run on one machine. Compared alternatives are timed in alternation. Drake
-is not needed.
+All numbers come from one run on one machine. Alternatives that are compared are timed in
+alternation. Drake is not needed.
 """
 
 from __future__ import annotations

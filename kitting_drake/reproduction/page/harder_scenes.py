@@ -59,8 +59,8 @@ above the second. The last column counts the generalist's episodes that ended wi
 
 
 def harder_scenes_text(runs: Sequence[Run]) -> str:
-    """Writes the section: strict success of each policy, the generalist's largest forces, and how
-    often its reason to stop was right. It is empty if there are no runs.
+    """Writes the section: the strict success of each policy, and for the generalist also the
+    largest forces and the number of right reasons to stop. Without runs the section is empty.
 
     Args:
         runs: all runs. The runs of the table have names that begin with `scenes_`.

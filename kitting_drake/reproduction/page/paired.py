@@ -16,7 +16,8 @@ _RESAMPLES = 10_000
 _TAILS = (2.5, 97.5)
 """The percentiles of a 95 % interval."""
 _FEWEST_TOOLS = 3
-"""A bootstrap over tools is informative if at least this many tools ever fail."""
+"""A bootstrap over tools is informative if at least this many tools ever fail, and at least this
+many ever succeed."""
 
 STRICT, OWN = "strict_success_rate", "success_rate"
 """The two rates of an episode: of strict success, and of success by the task's own measure."""
@@ -81,8 +82,7 @@ def mean_paired_difference(
 
 
 def points_text(found: Estimate) -> str:
-    """Formats a difference of rates in percentage points. Adds its interval if any episode
-    differs."""
+    """Formats a difference of rates in percentage points, with its interval or "none differs"."""
     if found.low == found.high == 0:
         return "+0.0 (none differs)"
     return f"{100 * found.value:+.1f} ({100 * found.low:+.1f} to {100 * found.high:+.1f})"

@@ -207,7 +207,8 @@ def has_unlimited_hand(scenario: Mapping[str, Any]) -> bool:
 def _with_present_hand(planner: dict[str, Any]) -> dict[str, Any]:
     """Returns the fields of an older run's planner, updated for comparison with present runs.
 
-    Fields that the older version lacked or had at its defaults get the present defaults.
+    Missing fields (`_LIMITED_HAND`) are added with the present defaults. Fields that have the older
+    defaults (`_UNLIMITED_HAND`) get the present ones.
     """
     defaults = _defaults()["planner"]
     former = [key for key, value in _UNLIMITED_HAND.items() if planner.get(key) == value]

@@ -41,8 +41,9 @@ ROTATIONS = 18
 EVERY_CHANCE = "every_chance"
 """The label of the cells of `_every_chance`."""
 BEYOND_OF_TABLE_1 = ("stack_block_pyramid",)
-"""The tasks of table I that are run with our extensions as well. On these, the published SO(2)
-method scores lower in our runs than in the paper, after ten or a hundred demonstrations."""
+"""The tasks of table I that are run both as published and with our extensions. In our runs as
+published, the SO(2) method scores lower on them than in the paper, after ten or a hundred
+demonstrations."""
 
 
 def _paper_cell(

@@ -54,8 +54,8 @@ def count_parameters(method: str, preset: str) -> dict[str, int]:
         preset: the size of the networks.
 
     Returns:
-        The counts by the names in `COLUMNS`. The Transporter's f_pick is under `alpha`, and it has
-        no `beta`.
+        The counts by the names in `COLUMNS`. For the Transporter, `alpha` has the count of f_pick,
+        and there is no `beta`.
     """
     # Import torch lazily.
     from kitting_drake.policies.networks.architecture import NetworkConfig

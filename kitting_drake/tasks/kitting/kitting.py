@@ -298,8 +298,8 @@ class Kitting(_DrawnKitting):
         ]
     )
 
-    # The tools for which the cavities are made, one for each of `tools`, such as outlines traced
-    # from photos. If empty, the cavities are made for `tools` themselves.
+    # The tools for which the cavities are made, one for each of `tools`: for example, the same
+    # tools as traced from photos. If empty, the cavities are made for `tools` themselves.
     cavities: list[str] = field(default_factory=list)
 
     @property

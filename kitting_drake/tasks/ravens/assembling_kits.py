@@ -64,8 +64,8 @@ class AssemblingKits(PoseTask):
     # Which of the project's shapes are used: train (14 shapes) or test (6 shapes).
     split: str = "train"
 
-    # A folder of meshes of flat shapes with z up, such as those of Ravens, that replace the
-    # project's shapes.
+    # A folder of meshes that replace the project's shapes, such as the meshes of Ravens. They must
+    # be flat shapes with z up.
     shapes: str = ""
 
     # Scale of the meshes in `shapes` along x, y and z, in metres per unit of the mesh. The default

@@ -33,7 +33,7 @@ needs_renderer = pytest.mark.skipif(not can_render(), reason="images cannot be r
 
 @pytest.fixture(scope="module")
 def tools() -> list[RandomTool]:
-    """Three random tools: composed of shapes, from a family's design, and a simple part."""
+    """Three random tools: one composed of solids, one from a family, and one simple part."""
     return [draw_tool(ENTRIES, np.random.default_rng(seed), str(seed)) for seed in (3, 9, 12)]
 
 

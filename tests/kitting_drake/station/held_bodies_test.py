@@ -17,10 +17,11 @@ COM = np.array([0.03, 0.01, -0.02])
 
 
 def step(moves: bool) -> tuple[RigidTransform, RigidTransform, RigidTransform]:
-    """Makes a step with a body 0.1 m beside the hand, which moves with the hand or rests.
+    """Makes a step with a body 0.1 m beside the hand. The body moves with the hand or rests.
 
     Returns:
-        Three X_WB after the step: uncorrected, corrected, and of a body welded to the hand.
+        Three poses X_WB after the step: the uncorrected pose, the corrected pose, and the pose of a
+        body that is welded to the hand.
     """
     arm, gripper = arm_model(FrankaArm())
     context = arm.CreateDefaultContext()

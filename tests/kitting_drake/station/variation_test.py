@@ -24,7 +24,7 @@ def scene() -> Scene:
 
 
 def mass_factors(scene: Scene, seed: int, spread: float = SPREAD) -> np.ndarray:
-    """The factors by which variation changes the masses of a scene's objects, all of 10 g."""
+    """The factors by which variation changes the objects' masses, which are 10 g without it."""
     plant, _ = AddMultibodyPlantSceneGraph(DiagramBuilder(), time_step=0.01)
     objects, _ = add_models(plant, scene, Variation(mass=spread), seed)
     masses = [plant.get_body(item.body).default_mass() for item in objects]

@@ -35,8 +35,8 @@ _CELL = 0.5
 # through a label.
 _SOLID, _WALL, _CAVITY, _LABEL = 1.0, 30.0, 12.0, 8.0
 _FOOT, _FOOT_SIDE, _OFF_THE_MIDDLE = 3.0, 8.0, 2.0
-"""Additional costs of a cut per mm of its length: through a foot; along a foot's side; and, between
-two feet, per mm of the cut's distance from the middle."""
+"""Additional costs of a cut per mm of its length: through a foot, and along a foot's side. Between
+two feet, `_OFF_THE_MIDDLE` is added for each mm of the cut's distance from the middle."""
 _ROOMY = 4.0
 """Where possible, cuts stay at least this far from cavities, in mm."""
 _STEEPEST = 4

@@ -159,7 +159,7 @@ def _paper(sides: list[float]) -> tuple[str, float]:
 
 
 def _writer(root: ElementTree.Element, text: bytes) -> tuple[str | None, int]:
-    """Returns the program that wrote an SVG, or None if unknown, and its pixels per inch."""
+    """Returns the program that wrote an SVG, or None if unknown, and the SVG's pixels per inch."""
     head = text[:4000]
     layers = [e.get("id", "") for e in root.iter() if e.get("data-name") or e is root]
     illustrator = b"Adobe Illustrator" in head or b"ns.adobe.com/AdobeIllustrator" in head

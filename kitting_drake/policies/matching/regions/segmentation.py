@@ -113,7 +113,7 @@ class Segmentation:
         """The recesses that contain no object.
 
         They are wide, are seen, and have a flat floor. A filled recess shows narrow gaps around the
-        object, or a surface that is not flat, or one that is mostly just below the fixture's top.
+        object, a surface that is not flat, or a surface mostly just below the fixture's top.
         """
         return tuple(
             item

@@ -46,7 +46,7 @@ _BLIND = 0.020
 
 @dataclass(frozen=True)
 class Visibility:
-    """Which pixels of an observation some camera sees, and which lie within some camera's view."""
+    """The pixels of an observation that a camera sees, and those in a camera's field of view."""
 
     seen: Mask
     """(rows, cols) mask of the pixels that some camera sees."""

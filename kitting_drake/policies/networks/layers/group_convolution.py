@@ -4,10 +4,10 @@ Between regular fields of C_N, or of C_N / C_q, with M = N / q channels, every s
 
     K[m, n](x) = kappa[(n - m) mod M](R_m^-1 x),
 
-where R_m is the rotation by 2 pi m / N. The kernels to output channel 0 can be chosen freely, and
-those to channel m are their rotated copies. escnn spans the same space, but its basis of M B
-kernels, each with M^2 numbers per pixel, does not fit into memory at N = 180. This layer stores
-only B patterns in M rotations.
+where R_m is the rotation by 2 pi m / N. The kernels to output channel 0 can be chosen freely: each
+is a combination of B patterns. The kernels to channel m are their rotated copies. escnn spans the
+same space with a basis of M B kernels. Each of these has M^2 numbers per pixel, so the basis does
+not fit into memory at N = 180. This layer stores only the B patterns in M rotations.
 """
 
 from __future__ import annotations

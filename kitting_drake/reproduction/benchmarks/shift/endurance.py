@@ -205,8 +205,8 @@ def _in_worker(workers: Workers, chosen: ChosenScenario, seed: int) -> ShiftScen
 
 
 def _lost(seed: int, why: str, wall_seconds: float = 0.0) -> ShiftScene:
-    """Makes the record of a scene without a result, of which only the reason of the failure is
-    known. It counts as one assist."""
+    """Makes the record of a scene that failed without a result. Only the reason is known, and the
+    scene counts as one assist."""
     scene = ShiftScene(seed, 0.0, tools=0, assists={"scene": FAILED}, failure=why)
     scene.wall_seconds, scene.commit = wall_seconds, commit()
     return scene

@@ -17,7 +17,7 @@ def ring() -> trimesh.Trimesh:
 
 
 def two_feet() -> trimesh.Trimesh:
-    """A bridge: two rims in one plane, side by side."""
+    """A bridge. The undersides of its two feet have separate rims in one plane."""
     legs = [trimesh.creation.box((20, 30, 20), np.eye(4)) for _ in range(2)]
     for leg, x in zip(legs, (-80, 80), strict=True):
         leg.apply_translation((x, 0, -10))

@@ -26,10 +26,11 @@ def dense_tree(tool: Tool, number: int) -> cKDTree:
 def mean_surface_distance(
     tool_a: Tool, tool_b: Tool, count: int = 4000, dense: int = 100_000
 ) -> float:
-    """The symmetric mean distance of two surfaces, in metres, at a common length.
+    """The symmetric mean distance of two tools' surfaces, in metres.
 
-    The tools are aligned by their frames T. `count` points on each surface, sampled by area, are
-    compared with the nearest of `dense` points on the other, and both means are averaged.
+    The tools are scaled to a common length and aligned by their frames T. `count` points on each
+    surface, sampled by area, are compared with the nearest of `dense` points on the other, and both
+    means are averaged.
     """
 
     def one_way(source: Tool, target: Tool) -> float:

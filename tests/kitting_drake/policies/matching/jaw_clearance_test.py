@@ -1,4 +1,4 @@
-"""Grasps for which o_t shows enough room for the jaws, as the planner moves them."""
+"""Grasps are found where o_t shows enough room for the jaws along the planner's motion."""
 
 import dataclasses
 

@@ -67,7 +67,7 @@ def test_angles_are_equivariant_to_rotations_by_90_degrees(orientations: int):
     ("orientations", "count"), [(36, 902_880), (72, 1_805_040), (120, 3_007_920), (180, 4_511_520)]
 )
 def test_the_paper_s_angle_network_has_the_authors_size(orientations: int, count: int):
-    # The authors report 0.90, 1.81, 3.01 and 4.51 million.
+    # The authors report 0.90, 1.81, 3.01 and 4.51 million parameters.
     fibre = Regular(orientations, quotient=2)
     network = AngleNet(4, fibre, fibre, PRESETS["paper"].group_angle, GroupConv2d)
     assert sum(weight.numel() for weight in network.parameters()) == count

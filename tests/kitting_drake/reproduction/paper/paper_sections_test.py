@@ -184,7 +184,8 @@ def test_a_matched_baseline_is_compared_with_the_usual_one_and_with_ours():
 def test_an_interval_over_tools_needs_drawn_tools():
     pair = [make_run(f"{task}_so2_180_100", [1.0, 1.0, 1.0, 1.0]) for task in ("seen", "unseen")]
     for run in pair:
-        # Every object of the first episode fails, so that the interval over tools is defined.
+        # An interval over tools needs at least three tools that fail, so let all objects of the
+        # first episode fail.
         first = run.summary["outcomes"][0]
         first["objects"] = dict.fromkeys(first["objects"], 0)
     every = sections(pair).split("### Every cell")[1]
