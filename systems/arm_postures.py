@@ -173,7 +173,7 @@ class ArmPostures:
         best: list[NDArray[np.float64]] = []
         least = math.inf
         for half_turn in (0, 1):
-            # For each option of the latest stop: time and postures of the fastest way there.
+            # The time and the postures of the fastest way to each option of the previous stop.
             ways = [(0.0, [now])]
             for found in options:
                 following = []

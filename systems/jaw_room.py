@@ -11,10 +11,10 @@ from systems.hand_geometry import FINGER_LENGTH, FINGERTIP_DEPTH, MAX_OPENING
 from systems.signals import PixelGrid, PlanarPose
 
 _LEVEL = 0.3
-"""The width is measured at this fraction of the object's height above its support, below where the
-pads grip."""
+"""The width is measured at this fraction of the object's height above its support. The pads grip
+higher."""
 _ROOM = 0.005
-"""Clearance between object and finger that must also be free, in m."""
+"""The gap between the object and each finger, in m. Nothing may stand in it."""
 _LINES = 7
 """Number of lines across the pads along which the width is measured."""
 

@@ -83,9 +83,9 @@ class PickPlaceParameters:
     # A grasp counts as empty if the squeezing pads are closer to each other than this, in m.
     minimum_width: float = bounded(0.0005, 0.0, 0.08)
 
-    # Closed jaws press down an object that sticks out of its cavity with `press_force`, in N, and
-    # go at most `press_depth`, in m, below its top. They touch it at `touch_speed`; the force
-    # overshoots by about 5 N.
+    # If an object sticks out of its cavity, closed jaws press on its top with `press_force`, in N,
+    # and go down from there by at most `press_depth`, in m. They touch the object at `touch_speed`;
+    # the force overshoots by about 5 N.
     press_force: float = bounded(30.0, 1.0, 140.0)
     press_depth: float = bounded(0.020, 0.001, 0.05)
 

@@ -348,7 +348,7 @@ def _unit_field(
 
 
 def _upper_quantile(share: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The value that a given share of standard normal values exceeds."""
+    """The value above which a given share of the standard normal distribution lies."""
     # Import SciPy lazily.
     from scipy.special import ndtri
 

@@ -131,8 +131,8 @@ _SHADOW = np.ones((3, 3), bool)
 """A hole into which this square fits may be the shadow of an object. A narrower hole is a gap
 between points that a camera measured."""
 _HIDDEN_BELOW = 0.005
-"""Of the pixels around a shadow, those at most this much above the lowest one, in metres, count as
-the hidden surface. Higher pixels may belong to the object that casts the shadow."""
+"""A pixel beside a shadow shows the hidden surface if it is at most this much, in metres, above the
+lowest such pixel. Higher pixels may belong to the object that casts the shadow."""
 
 
 def fill_unseen(

@@ -89,7 +89,8 @@ def claim_folder(folder: Path, name: str, described: Any, *, of: str) -> None:
         folder: the folder.
         name: the name of the JSON file.
         described: the run's description, serializable as JSON.
-        of: what identifies a run, for error messages, such as `scenario or version`.
+        of: what identifies a run, such as `scenario or version`, for the error message "the
+            folder holds the files of another ...".
 
     Raises:
         UserError: the folder contains other files, or those of a different run.

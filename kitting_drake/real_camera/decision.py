@@ -61,7 +61,7 @@ class BenchDecision:
 
     @property
     def action(self) -> PickPlaceAction:
-        """The pick and place in the base frame; a stop if the result is no action."""
+        """The pick and place or the press, in the base frame; for all other results, a stop."""
         return self.choice.action
 
     @property

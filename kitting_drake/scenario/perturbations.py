@@ -57,7 +57,7 @@ _OVERLAYS: dict[str, tuple[dict[str, Any], ...]] = {
     "distractors": tuple({"task": {"distractors": count}} for count in (2, 4, 8)),
 }
 _WORSE_IF_LESS = ("steepest_deg",)
-"""Fields for which a lower value is a stronger perturbation; for all others, a higher value is."""
+"""In these fields, a lower value perturbs more. In all other fields, a higher value does."""
 
 NAMES = (*_OVERLAYS, "all")
 

@@ -47,8 +47,8 @@ class ScrewdriverParameters:
     corner_radius_mm: float = 10.5
     # The height of the handle; None: the same as its width.
     handle_height_mm: float | None = None
-    # The diameter of a coloured sleeve on the shaft (0 for none), and the length of the shaft that
-    # it leaves bare.
+    # The diameter of a coloured sleeve on the shaft (0 for none), and the length of the shaft in
+    # front of the sleeve.
     sleeve_diameter_mm: float = 0.0
     bare_mm: float = 25.0
     # The materials of the parts. Each is a key of solids.MATERIALS.

@@ -52,7 +52,7 @@ def _phillips(start: float, end: float, diameter: float, length: float, width: f
 
 
 def _prismatic(outline: CrossSection) -> Callable[[float, float, float, float, float], Shape]:
-    """Returns a function that builds a tip of constant section on a round shaft that tapers to it.
+    """Returns a function that builds a tip of constant section. A round shaft tapers towards it.
 
     `outline` is the section for a tip of width 1.
     """

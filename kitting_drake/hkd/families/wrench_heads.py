@@ -106,7 +106,7 @@ def _flat_part(
 def _open(head: Head, x: float, turn_deg: float, bevel: float) -> HeadShape:
     """Draws a disc with two jaws in front.
 
-    The slot has parallel flanks, slightly flared lips, and a floor with two facets of the hexagon.
+    The slot has parallel flanks, slightly flared lips, and a floor of two facets, as for a nut.
     """
     radius = head.diameter_mm / 2
     cheek = (0.82 if head.neck_mm else 0.9) * radius

@@ -21,7 +21,7 @@ _FORMAT_VERSION = "1"
 """The version of the files in the cache. Increase it when the same tool gives different grasps."""
 _FILE = "grasps.json"
 _EASY_MOMENT = 0.18
-"""The moment about the axis through both pads that the grip easily withstands, in N m."""
+"""The grip easily withstands this moment about the axis through both pads, in N m."""
 _WORST = 12.5
 """The cost (`GraspProposal.cost`) above which proposals are left out."""
 

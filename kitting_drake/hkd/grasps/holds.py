@@ -27,7 +27,7 @@ BIN = 0.0005
 _FINGER_RECESS = 0.003
 # The largest inward lean, in radians, of a face that does not slip out of the pads.
 _STEEPEST = np.radians(28.0)
-# The least share of the pads' length along which both pads must touch, except at a corner.
+# The least share of the pads' length along which both pads must touch the tool, except at a corner.
 _LEAST_CONTACT = 0.15
 
 # The numbers of columns in half the length of the pads, and in half the length of the fingers.

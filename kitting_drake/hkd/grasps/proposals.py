@@ -58,9 +58,9 @@ class GraspProposal(Grasp):
     offset: float
     """The horizontal distance between the centre of mass and the grasp, in metres."""
     contact: float
-    """The share of the pads' length, 0 to 1, along which both pads touch."""
+    """The share of the pads' length, 0 to 1, along which both pads touch the tool."""
     depth: float
-    """The mean vertical extent of the pads' contact, as a share of the grasp depth, 0 to 1."""
+    """The mean height over which a pad touches the tool, as a share of the grasp depth, 0 to 1."""
     slope: float
     """The inward lean of the gripped faces at the pads' lower edges, in radians."""
     overhang: float

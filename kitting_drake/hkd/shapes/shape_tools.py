@@ -41,7 +41,7 @@ RAVENS_SCALE = (0.003, 0.003, 0.001)
 """The scale of the meshes of Ravens' assembling-kits, in metres per unit along x, y and z."""
 
 _FORMAT_VERSION = "1"
-"""The version of the files in the cache. Increase it when equal inputs give different files."""
+"""The version of the files in the cache. Increase it if a change of the code changes the files."""
 _DENSITY = 1150.0
 """The density of the shapes, in kg/m^3."""
 _COLOURS = ("red_grip", "blue_grip", "yellow_grip", "green_grip", "orange_grip", "hickory")

@@ -16,7 +16,7 @@ from kitting_drake.hkd.tools.meshes import write_convex_obj
 from kitting_drake.hkd.tools.tool import Tool
 
 _FORMAT_VERSION = "3"
-"""The version of the files in the cache. Increase it when equal inputs give different files."""
+"""The version of the files in the cache. Increase it if a change of the code changes the files."""
 _STIFFER = 25.0
 """The factor by which the hydroelastic modulus is increased. It keeps the kit's walls from sinking
 into the tool by more than the clearance."""

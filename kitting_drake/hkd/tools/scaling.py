@@ -20,10 +20,10 @@ from systems.grip_force import GRAVITY
 from systems.hand_geometry import MAX_OPENING
 
 _FORMAT_VERSION = "1"
-"""The version of the files in the cache. Increase it when equal inputs give different files."""
+"""The version of the files in the cache. Increase it if a change of the code changes the files."""
 _SAME_LENGTH = 1e-9
 _EASY_MOMENT = 0.2
-"""The moment about the axis through both pads that the grip holds easily, in N m."""
+"""The grip easily withstands this moment about the axis through both pads, in N m."""
 _WIDEST = MAX_OPENING - 0.015
 """The largest width of the `other_grasps` of a scaled tool, in metres; wider ones are dropped."""
 

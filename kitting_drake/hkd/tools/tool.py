@@ -168,7 +168,7 @@ def load_tool(name: str, base: Path | None = None) -> Tool:
 
     Args:
         name: a name, or a path that is absolute or relative to `base`. If several tools match, the
-            project's own tool is chosen before the user's tool, and a path last.
+            first of these is chosen: the project's own tool, the user's tool, the path.
         base: the folder to which relative paths refer; the working directory if None.
 
     Raises:

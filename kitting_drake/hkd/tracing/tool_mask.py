@@ -65,7 +65,7 @@ class ShadowLook:
     """The largest ratio of a shadow's roughness to that of the plain ground."""
     shine: float
     """A brightness step is soft if it is wider than this, in mm. A bay or hole is a reflection if
-    its border with the tool is soft on at least 30 % of its length."""
+    at least 30 % of its border with the tool is soft."""
 
 
 CAREFUL = ShadowLook(0.3, 2.0, 1.2)
@@ -78,7 +78,7 @@ the mask for these limits differs from the mask for `CAREFUL` or `MIDDLE`."""
 _LOW_MM = 9.0
 _COARSE_PX_PER_MM = 3.5
 _FINE_PX_PER_MM = 5.0
-"""At lower resolutions than this, blur widens brightness steps, so the limits of their width are
+"""Below this resolution, blur widens the brightness steps, so the limits of a step's width are
 raised."""
 
 
@@ -211,8 +211,8 @@ class ToolMasks:
     def _without_shine(self, tool: Array, widest: float) -> Array:
         """Fills the bays and holes of a mask that are reflections on a tool.
 
-        Their border with the tool is soft, or they are brighter than the ground. A brightness
-        step that is wider than `widest`, in mm, is soft.
+        Their border with the tool is soft, or they are brighter than the ground. A brightness step
+        that is wider than `widest`, in mm, is soft.
         """
         cv2, px_per_mm = self._cv2, self._px_per_mm
         closed = _closed(cv2, tool, _BAY_MM * px_per_mm, px_per_mm)

@@ -181,7 +181,7 @@ def coarse_cost(outline: Outline, recess: Outline) -> float:
 def preference(
     outline: Outline, recess: Outline, first: Registration, second: Registration
 ) -> float:
-    """Returns how much better the first fit is than the second, where they differ, in metres.
+    """Returns how much better the first fit is than the second, in metres; negative if it is worse.
 
     If a tool is rotated by half a turn, most of its outline looks the same, and the mean costs of
     the two fits differ only by noise. So each point is weighted by the difference of the two fits

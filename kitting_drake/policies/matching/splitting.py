@@ -56,8 +56,8 @@ _CLEARLY = 0.65
 """An object's outline agrees clearly with the region's outline if at least this fraction of the
 object's outline coincides with it."""
 _LEAST_PART = 0.35
-"""A region can contain the object for a recess only if the region's area is more than this share of
-the recess's area."""
+"""A region can contain the object of a recess only if the region's area exceeds this share of the
+recess's area."""
 _HIGHER = 0.006
 """Pixels that are higher than an object's median height by more than this, in metres, belong to
 something that lies on the object."""
@@ -195,8 +195,9 @@ def _judge(
     relief: NDArray[np.float32],
     resolution: float,
 ) -> _Found | None:
-    """Returns the object inside a recess's outline that was fitted to a region. Returns None if the
-    two outlines do not agree well enough, or if something lies across the object's outline."""
+    """Cuts an object out of a region, by a recess's outline that was fitted to the region. Returns
+    None if the two outlines do not agree well enough, or if something lies across the object's
+    outline."""
     rows, cols = np.indices(region.shape)
     positions = np.stack([rows, cols], axis=-1).reshape(-1, 2)
     back = (positions - fit.shift) @ rotation_matrix(fit.rotation)

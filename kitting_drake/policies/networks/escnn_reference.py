@@ -171,7 +171,7 @@ def _convolution(source: nn.Module) -> enn.R2Conv:
 
 
 def _fourier_elu(source: nn.Module, *, invariant: bool = False) -> enn.FourierELU:
-    """Makes the nonlinearity after a convolution, with the output fibre's number of samples."""
+    """Makes the nonlinearity after a convolution, with as many samples as the output fibre has."""
     assert isinstance(source, SteerableConv2d)
     assert isinstance(source.out_fibre, Irreps)
     return enn.FourierELU(

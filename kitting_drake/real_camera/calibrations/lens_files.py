@@ -142,7 +142,7 @@ def _kalibr(content: dict[str, Any], where: str, stream: str) -> dict[str, Any]:
 def _open3d(content: dict[str, Any], where: str) -> dict[str, Any]:
     """Converts the intrinsics of Open3D to our own layout.
 
-    The mapping is a PinholeCameraIntrinsic, a PinholeCameraParameters, or from Open3D's recorders.
+    They come from a PinholeCameraIntrinsic, a PinholeCameraParameters or one of Open3D's recorders.
     """
     inner = content.get("intrinsic", content)
     if not isinstance(inner, dict):

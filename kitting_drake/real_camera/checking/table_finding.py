@@ -45,10 +45,10 @@ _LEAST_SHARE = 0.1
 _LEAST_POINTS = 500
 """The least number of points that must lie on the table."""
 _ABOVE_FLOOR = 0.25
-"""A level plane that is higher than the largest plane by more than this, in metres, is the table.
-The largest plane is then the floor."""
+"""If a level plane is more than this above the largest plane, in metres, it is the table, and the
+largest plane is the floor."""
 _TABLE_SHARE = 0.1
-"""A table above a floor must have more than this share of the number of the floor's points."""
+"""The least number of points on a table, as a share of the number of points on the floor."""
 _BAND = 0.006
 """Points within this distance of the plane, in metres, belong to it. Three times the noise is used
 if that is larger."""

@@ -131,7 +131,7 @@ def _decompressed(data: bytes, size: int) -> bytes:
         if start < 0:
             raise ValueError("the data are damaged")
         while length > 0:
-            # The bytes to copy may include some that this copy adds, so copy in pieces.
+            # The source may overlap the bytes that this copy appends, so copy in pieces.
             piece = result[start : start + length]
             result += piece
             start, length = start + len(piece), length - len(piece)

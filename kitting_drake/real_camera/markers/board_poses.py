@@ -25,8 +25,8 @@ corners are poor."""
 _SAME = math.radians(1)
 """The angle in radians below which two poses count as the same."""
 _CLEARER = 16.0
-"""A pose is ambiguous if another pose fits almost as well: if the sum of the corners' squared
-errors grows by less than this multiple of the error variance of one corner."""
+"""A pose is ambiguous if another pose fits almost as well: its sum of the corners' squared errors
+is larger by less than this multiple of the error variance of one corner."""
 _LIKELY = 0.2
 """The test for ambiguous poses assumes an error of the corners of at least this, in pixels."""
 _NOISE = 0.05

@@ -111,7 +111,7 @@ def _without_others(networks: Networks, names: set[str]) -> Networks:
 def _compute_angles(networks: Networks, setup: SpeedSetup, n: int) -> Callable[[], object]:
     """Returns a function that computes all angles at a known pixel.
 
-    It does not read the result, because the result has no values on the meta device.
+    The function does not read the values of its result, because the meta device computes none.
     """
     if isinstance(networks, FactoredNetworks):
         crops = networks.prepare(crop(setup.image, setup.pixel, PICK_CROP))

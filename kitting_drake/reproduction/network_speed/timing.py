@@ -114,7 +114,7 @@ def measure_peak(type_: torch.dtype, device: torch.device, *, side: int) -> dict
     Args:
         type_: the type in which to compute.
         device: the device on which to compute.
-        side: the side of the matrices; the convolution has an eighth as many channels.
+        side: the side of the matrices. The convolution has `side / 8` channels.
 
     Returns:
         `matmul`, the rate of a product of large square matrices; `convolution`, the rate of a wide

@@ -209,7 +209,7 @@ def reference(training: Training) -> Training:
 
 
 def rates_key(chosen_by: Training) -> str:
-    """Returns the key in `Rates` of a training that `reference` returned."""
+    """Returns the key in `Rates` of a training. The training is a result of `reference`."""
     return f"{chosen_by.task}_{chosen_by.method}"
 
 

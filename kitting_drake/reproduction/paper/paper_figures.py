@@ -21,7 +21,8 @@ _COLOURS = {10: "#009e73", 100: "#d55e00"}
 """Green and orange as in the paper, in shades that the colour-blind can distinguish."""
 _MARKERS = {"so2": "o", "equivariant_transporter": "s", "transporter": "^"}
 _STEP = 0.12
-"""The distance between neighbouring markers of one N. Successive N are at a distance of 1."""
+"""The distance between neighbouring markers with the same N. Groups with successive N are 1
+apart."""
 _ROWS = {
     ("so2", 36): ("#e69f00", "o"),
     ("so2", 180): ("#d55e00", "D"),
@@ -31,8 +32,8 @@ _ROWS = {
 """The rows of table I (method and N), with markers and with colours that the colour-blind can
 distinguish."""
 _ROW_STEP = 0.19
-"""The distance between neighbouring markers of one number of demonstrations. Successive numbers are
-at a distance of 1."""
+"""The distance between neighbouring markers with the same number of demonstrations. Groups with
+successive numbers are 1 apart."""
 _STYLE = {
     "font.size": 13,
     "axes.edgecolor": "0.5",

@@ -45,7 +45,7 @@ def paper_sections(
     efficiency: Mapping[str, Any] | None = None,
     to_run_again: Collection[str] = (),
 ) -> list[str]:
-    """Writes the sections that compare with the paper; there are none without results.
+    """Writes the sections that compare with the paper. Without results the list is empty.
 
     Args:
         results: the results from `cell_results`.

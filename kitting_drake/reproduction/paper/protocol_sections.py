@@ -58,7 +58,7 @@ _TOLD = ("trained_orientations", "steps", "learning_rate", "training_seed", "com
 def protocol_sections(
     results: Sequence[Result], rates: Rates, to_run_again: Collection[str] = ()
 ) -> list[str]:
-    """Writes the sections on the cells of the paper's tables; there are none without results.
+    """Writes the sections on the cells of the paper's tables. Without results the list is empty.
 
     Args:
         results: the results from `cell_results`.

@@ -89,8 +89,8 @@ class StartCheck:
         }
 
     def may_settle(self, X_WTools: Sequence[RigidTransform]) -> bool:
-        """Whether drawn poses may become a valid start. Only touching tools, which hardly move, are
-        checked before the simulation."""
+        """Whether it is worth simulating how tools settle from random poses. Only the kind
+        `touching` is checked, because its tools hardly move."""
         return self._kind != "touching" or self._is_graspable(X_WTools)
 
     def may_go_on(self, X_WTools: Sequence[RigidTransform]) -> bool:

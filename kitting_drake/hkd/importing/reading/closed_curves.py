@@ -201,7 +201,7 @@ def _page_of(sides: Points, page_mm: tuple[float, float] | None) -> str | None:
 
 
 def _joined(drawn: DrawnCurves, path: Path, notes: list[str]) -> list[tuple[Points, int | None]]:
-    """Joins curves whose ends meet into closed curves.
+    """Joins curves at their ends, so that they form closed curves.
 
     Returns:
         The points (n, 2) of each closed curve in mm, and its element (see `Curve`).

@@ -20,7 +20,7 @@ Fixture = tuple[Mask, Plane]
 _MOST_FIXTURES = 4
 """The largest number of fixtures."""
 _COMPARABLE = 0.3
-"""The least area of every other fixture, as a share of the largest fixture's area."""
+"""Every further fixture has at least this share of the largest fixture's area."""
 PLANE_BAND = 0.004
 """A pixel belongs to a plane if their heights differ by less than this, in metres."""
 _LEAST_FIXTURE_HEIGHT = 0.015

@@ -150,7 +150,8 @@ def _from(seed: int) -> Iterable[int]:
 def _shift(
     done: dict[int, ShiftScene], seed: int, wanted: float, exchange: float
 ) -> list[ShiftScene]:
-    """Returns the scenes from the first seed on, without a gap, until the shift is over."""
+    """Returns the finished scenes from the first seed on, up to the end of the shift or up to the
+    first missing scene."""
     scenes: list[ShiftScene] = []
     total = 0.0
     for number in _from(seed):
