@@ -35,9 +35,9 @@ class Rig:
         return self.station.objects
 
     def port(self, name: str, root: Context | None = None) -> Any:
-        """The value of a port of the station: of the input `action`, or of an output.
+        """The value of the station's input port `action`, or of its output port `name`.
 
-        Without `root`, it is the value in the default context.
+        Without `root`, the default context is used.
         """
         root = self.diagram.CreateDefaultContext() if root is None else root
         context = self.station.GetMyContextFromRoot(root)

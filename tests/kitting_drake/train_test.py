@@ -694,8 +694,8 @@ def test_a_nan_loss_ends_the_run(demos: Path, tmp_path: Path, monkeypatch: pytes
     assert not (tmp_path / "checkpoint.pt").exists()
 
 
-# Saves checkpoints often. Does not clip displacements, because all checkpoints would then score
-# alike.
+# Saves checkpoints often. Does not clip displacements: if they were clipped, all checkpoints would
+# score alike.
 KILLABLE = """
 from kitting_drake import train
 from kitting_drake.policies.training import training_run, validation

@@ -31,7 +31,7 @@ TEN = 10
 """The largest number of actions in most tests."""
 GRASP_Z = 0.05 - PARAMETERS.grasp_depth
 HANGING = GRASP_Z
-"""How far the held object extends below the fingertips: to the table, on which it stood."""
+"""How far the held object extends below the fingertips. It stood on the table when gripped."""
 WIDTH, WEIGHT = 0.02, 6.0
 NO_TOUCH = -1.0
 

@@ -76,7 +76,7 @@ def test_a_stage_that_was_complete_when_an_action_began_is_kept():
     # From then on the stage counts as filled, even if its object leaves, and later goals count.
     assert advance(Mode.RETREAT, away, second) == [1.0, 0.0]
     assert system.GetOutputPort("reward").Eval(context).tolist() == [1.0]
-    # The kept goals are state of the context, not of the system.
+    # The kept goals are stored in the context, not in the system.
     clone = context.Clone()
     assert system.reward(clone) == 1.0
     system.SetDefaultContext(context)

@@ -32,7 +32,7 @@ class Table:
         self.poses[HAND] = RigidTransform([0, 0, AWAY])
 
     def advance(self, seconds: float) -> Context:
-        """Advances by some time, without the update at its end."""
+        """Advances by some time. An update that is due at the end is not executed yet."""
         context = self.simulator.get_mutable_context()
         poses = [RigidTransform(), *(self.poses[i] for i in (LEFT, RIGHT, HAND))]
         self.detector.GetInputPort("body_poses").FixValue(context, Value(poses))

@@ -99,7 +99,7 @@ def test_sleep_does_not_change_the_result():
 
 
 class Seated:
-    """A simulation without sleep of tools at or near their cavities; the hand does not move."""
+    """A simulation of tools at or near their cavities. No tool sleeps, and the hand is at rest."""
 
     def __init__(self, *names: str) -> None:
         task = ArrangedKitting(

@@ -155,7 +155,7 @@ def test_a_closed_connection_is_not_an_error(
     for _ in range(5):
         connection = socket.create_connection(server.server_address)
         connection.sendall(b"GET /steps/0/color.png HTTP/1.1\r\nHost: localhost:1\r\n\r\n")
-        # Closing resets the connection during the response.
+        # Let `close` reset the connection while the server responds.
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         connection.close()
     get(server, "steps")

@@ -45,7 +45,11 @@ def readme() -> str:
 
 
 def rows(page: str, *sections: str) -> list[list[str]]:
-    """The cells of all tables of a page, or of one of its sections, as a list for each line."""
+    """The rows of all tables of a page, each as a list of its cells.
+
+    If `sections` has headings, only the section under the last one counts. Each heading is searched
+    after the one before.
+    """
     for section in sections:
         page = page.split(section, 1)[1]
     lines = page.split("\n#", 1)[0].splitlines() if sections else page.splitlines()

@@ -26,7 +26,7 @@ def grown(profile: CrossSection, distance: float) -> CrossSection:
         (CrossSection.circle(30.0, 48), 1),
         (angle_iron(), 2),
         (angle_iron().rotate(33.0), 3),
-        # Within 0.25 mm on either side, a straight edge replaces at most 12 degrees of an arc.
+        # A straight edge within 0.25 mm of the arc, on either side, spans at most 12 degrees.
         (ring_sector(100.0, 10.0, 90.0), 11),
         (CrossSection.square((40, 40)) + CrossSection.square((10, 10)).translate((60, 0)), 2),
     ],

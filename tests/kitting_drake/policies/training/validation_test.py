@@ -42,7 +42,11 @@ def predicted(
     rotation: float = 0.0,
     log_odds: float | None = None,
 ) -> Decision:
-    """The expert's action with given errors; those of the place are relative to the actual pick."""
+    """The expert's action with given errors.
+
+    The place moves with the pick, so that a wrong pick alone still places the object correctly.
+    The error `place` is added to that.
+    """
     pick_pixel = PICK + pick
     place_pixel = PLACE + rotation_matrix(ROTATION) @ np.array(pick) + place
     action = make_action(SEEN, pick_pixel, THETA + theta, place_pixel, ROTATION + rotation)

@@ -1,4 +1,4 @@
-"""The number of a run's actions that the memory of failed grasps can have changed, or its range."""
+"""The number of actions that the memory of failed grasps can have changed: exact, or a range."""
 
 from typing import Any
 

@@ -193,7 +193,7 @@ def test_tools_scaled_too_wide_for_the_jaws_raise(tmp_path: Path):
     shutil.copytree(MODELS / "tools" / "stubby_screwdriver", folder)
     tool = load_tool(str(folder))
     record = yaml.safe_load((folder / "tool.yaml").read_text())
-    # Scaled to a length of 0.2 m, the tool's grasp is as wide as the open jaws.
+    # If the tool is scaled to a length of 0.2 m, its grasp is as wide as the open jaws.
     record["grasp"]["width"] = 0.08 * tool.length / 0.2
     (folder / "tool.yaml").write_text(yaml.safe_dump(record))
     draw(0, ToolsetKitting(pool=[str(folder)], tool_length=[0.15, 0.19]))

@@ -168,8 +168,8 @@ SOLID = '<path fill="#333" d="M20 20h160v20h-160z"/>'
 @pytest.mark.parametrize(
     "content",
     [
-        # A frame around a tool without holes. The frame has sharp corners, has round corners, is
-        # as large as the page, or is part of the tool's path.
+        # The tool has no holes. The frame around it has sharp corners, has round corners, is as
+        # large as the page, or is part of the tool's path.
         f'<rect x="5" y="5" width="190" height="50" {LINE}/>' + SOLID,
         f'<rect x="5" y="5" width="190" height="50" rx="8" {LINE}/>' + SOLID,
         f'<rect width="200" height="60" {LINE}/><path {LINE} d="M20 20h160v20h-160z"/>',
