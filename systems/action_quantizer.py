@@ -18,7 +18,7 @@ class ActionQuantizer:
     """N, the number of orientations; angles are rounded to multiples of 2 pi / N."""
 
     def position(self, x: float, y: float) -> tuple[float, float]:
-        """Returns the pixel centre (x, y) nearest to a point. All are in the world, in metres."""
+        """Rounds a point to the nearest pixel centre (x, y). Both are in the world, in metres."""
         pixel = np.clip(np.round(self.grid.to_pixel((x, y))), 0, np.array(self.grid.shape) - 1)
         rounded_x, rounded_y = self.grid.to_world(pixel)
         return float(rounded_x), float(rounded_y)

@@ -289,8 +289,8 @@ class ArmPostures:
             return f"for {where} the arm would collide with {touched[0]}"
         if found:
             return f"the arm cannot lower its hand in a straight line to {where}"
-        # The yaw affects only joint 7. If the stop can be reached with another yaw, then with its
-        # own yaw joint 7 is out of range.
+        # The yaw affects only joint 7. If another yaw brings the stop within reach, it is joint 7
+        # that is out of range.
         if reached(*np.linspace(0.0, math.pi, 5)[:-1].tolist()):
             return f"{where} would take joint 7 out of its range"
         heights = f"between {stop.low:.3f} and {stop.high:.3f} m"

@@ -18,10 +18,9 @@ _SWIVELS = np.arange(-31, 32) / 10
 """The swivels that are tried, in rad: angles of the wrist to the vertical plane through base and
 hand, as in `systems.arm_postures`."""
 _STEP = 0.005
-"""Postures are computed with the hand at several distances from the base's axis. This is the step
-between them, in m."""
+"""Postures are computed for distances of the hand from the base's axis in steps of this, in m."""
 _FARTHEST = 1.0
-"""The largest of these distances, in m."""
+"""The largest distance of the hand from the base's axis, in m."""
 _CHUNK = 256
 
 

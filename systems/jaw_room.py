@@ -22,8 +22,8 @@ _LINES = 7
 def object_width(
     height: NDArray[np.float32], grid: PixelGrid, pick: PlanarPose, support: float, top: float
 ) -> float:
-    """Measures twice the distance from the pick to the farther side of the object, in the direction
-    in which the jaws close.
+    """Measures the width of an object between the jaws: twice the distance from the pick to the
+    farther side of the object.
 
     Args:
         height: (rows, cols) heights above the bottom of the grid, in m.
@@ -33,8 +33,8 @@ def object_width(
         top: height of the object's top at the pick, in m.
 
     Returns:
-        The width in m. It is infinite if the object is not seen at the pick, is wider than open
-            jaws, or if something stands where half-open fingers would go down.
+        The width in m. It is infinite if the object is not seen at the pick, if it is wider than
+            the open jaws, or if something stands where half-open fingers would go down.
     """
     level = support + _LEVEL * (top - support)
     farthest = MAX_OPENING / 2 + FINGERTIP_DEPTH

@@ -102,8 +102,8 @@ class Ledge:
 
 
 def _inside(outline: NDArray[np.float64]) -> float:
-    """How far to the left of its centre of mass an object reaches, in metres: the smaller of its
-    reaches just ahead of the centre of mass and just behind it."""
+    """How far an object extends to the left of its centre of mass, in metres. This is measured just
+    ahead of the centre of mass and just behind it, and the smaller value counts."""
     u, v = outline.T
     reach = u.max() - u.min()
     sides = [(sign * u > _BESIDE) & (sign * u < 0.3 * reach) for sign in (-1, 1)]

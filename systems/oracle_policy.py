@@ -234,7 +234,7 @@ class OraclePolicy(LeafSystem):
         tried: NDArray[np.float64] | None = None,
     ) -> list[int]:
         """Indices of the goals that may be filled now. Goals with a misplaced object come last.
-        Otherwise, goals whose object was tried less often come first.
+        Within both groups, goals whose object was tried less often come first.
 
         Args:
             poses: X_WB of each of the n objects.

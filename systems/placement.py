@@ -34,7 +34,7 @@ appeared yet."""
 _FAR = 0.5
 """When objects are assigned to goals, displacements are limited to this, in metres."""
 _NEAR = 0.05
-"""Objects farther than this from a goal, in metres, are assigned without a test whether they fill
+"""In the assignment, only objects within this distance of a goal, in metres, can count as filling
 it."""
 _FREE_ANGLES = 24
 """Number of headings that are compared for a goal that accepts any heading."""

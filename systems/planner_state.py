@@ -108,10 +108,10 @@ class PlannerState(VectorView):
     trusts_grip = Number()
     """1 if the trial lift has shown that the object will not turn on the way, else 0."""
     set_downs = Number()
-    """Number of earlier actions that set this object down again."""
+    """Number of earlier actions that lifted the present object and set it down again."""
     free_actions = Number()
-    """Number of actions so far that set their object down again. They do not count against the
-    limit of actions."""
+    """Number of actions that do not count against the limit, because they only lifted an object and
+    set it down again."""
     stop = Number()
     """0 until the planner stops; then 1 plus the index of the reason in `STOP_REASONS`."""
 

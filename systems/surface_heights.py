@@ -9,17 +9,17 @@ from systems.jaw_room import object_width
 from systems.signals import Observation, PlanarPose, SurfaceHeights
 
 _PICK_REACH = 1
-"""Radius around the pick that is searched for the object's top, in pixels."""
+"""The object's top is measured within this distance of the pick, in pixels."""
 _RIM_REACH = 0.025
-"""Radius around the place that is searched for a rim, in metres."""
+"""A rim is searched for within this distance of the place, in metres."""
 _FLOOR_REACH = 2
-"""Radius around the place that is searched for its floor, in pixels."""
+"""The floor of the place is measured within this distance of it, in pixels."""
 _PICK_CLEARANCE_REACH = 0.07
-"""Radius around the pick that the open jaws sweep, in metres."""
+"""The open jaws stay within this distance of the pick, in metres."""
 _PLACE_CLEARANCE_REACH = 0.125
-"""Radius around the place that the held object sweeps, in metres."""
+"""The held object stays within this distance of the place, in metres."""
 _SUPPORT_REACH = 0.08
-"""Radius around the pick that is searched for the object's support, in metres."""
+"""The object's support is searched for within this distance of the pick, in metres."""
 _SUPPORT_SHARE = 10.0
 """The support's height is estimated by this percentile of the heights around the pick."""
 _TABLE_SHARE = 5.0
@@ -38,8 +38,8 @@ _NOISY_RIM_SHARE, _NOISY_RIM_BIAS = 90.0, 1.0
 two thirds of these heights belong to the rim. The numbers are the percentile, and the estimate's
 bias in standard deviations of the noise."""
 _NOISY_FLOOR_SHARE, _NOISY_FLOOR_BIAS = 25.0, -0.67
-"""The percentile and the bias for the floor's height, which is estimated from the heights at the
-place."""
+"""With noise, the floor's height is estimated by a percentile of the heights at the place. The
+numbers are this percentile, and the estimate's bias in standard deviations of the noise."""
 _SUNK = 0.003
 """A table that looks lower than expected by more than this, in metres, is taken to be really lower.
 Any other deviation counts as a calibration error."""

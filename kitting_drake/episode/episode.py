@@ -44,8 +44,8 @@ class ObjectResult:
     cause: str | None
     """Why the object failed, one of the task's `causes`; None for a success."""
     measures: dict[str, bool] = dataclasses.field(default_factory=dict)
-    """Whether the object is a success by each of `Scene.measures` and, with the key `strict`, by
-    `strict_success`. Empty if the scene has no such measures."""
+    """Whether the object is a success, for each name in `Scene.measures`. The key `strict` stands
+    for `strict_success`. Empty if the scene has no such measures."""
 
 
 @dataclasses.dataclass

@@ -227,7 +227,7 @@ def _lost_cause(episode: Episode) -> str | None:
 
 
 def counted_actions(episodes: Sequence[Episode]) -> list[Entry]:
-    """The actions of the episodes that neither failed nor timed out."""
+    """The actions of completed episodes: failed and timed-out episodes are left out."""
     return [
         action
         for episode in episodes

@@ -61,7 +61,7 @@ def write(
     seeds: range = range(5),
     **fields: Any,
 ) -> None:
-    """Adds a run whose episodes all have these errors; `fields` replace those of its summary."""
+    """Adds a run with the same errors in every episode; `fields` replace fields of its summary."""
     episodes = [make_episode(seed, errors_mm) for seed in seeds]
     chosen = replace(CHOSEN, scenario=scenario)
     summary = summarise(episodes, chosen, ADD_S, wall_seconds_total=1.0)

@@ -267,7 +267,7 @@ def test_depths_out_of_range_are_ignored(out):
 
 def test_points_above_the_workspace_are_dropped_and_below_it_read_as_zero():
     depth = FLAT.copy()
-    depth[1, 2], depth[2, 2] = 0.3, 1.2  # The heights are 0.7, above z_max, and -0.2.
+    depth[1, 2], depth[2, 2] = 0.3, 1.2  # At heights 0.7 (above z_max) and -0.2.
     image = _project((COLOR, depth))
     np.testing.assert_allclose(image[:, 1, 2], [*(RGB[1, 1] + RGB[1, 3]) / 2, 0], atol=1e-6)
     np.testing.assert_allclose(image[:, 2, 2], [*RGB[2, 2], 0], atol=1e-6)

@@ -226,7 +226,7 @@ def believed_pose(*, seed: int, number: int = 0, **errors: float) -> RigidTransf
 
 
 def rig_error(seed: int) -> RigidTransform:
-    """The pose error that all cameras share, about the middle of the workspace."""
+    """The pose error common to all cameras, in a frame at the middle of the workspace."""
     middle = RigidTransform([0.5, 0.0, 0.0])
     errors = {"rig_position_error": 0.01, "rig_angle_error_deg": 2.0}
     return middle.inverse() @ believed_pose(seed=seed, **errors) @ POSE.inverse() @ middle

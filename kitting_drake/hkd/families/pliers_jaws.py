@@ -293,8 +293,7 @@ def _poll(j: Jaws, start: float, half: float) -> tuple[Line, Line]:
 
 
 def _pick(j: Jaws, start: float, half: float) -> tuple[Line, Line]:
-    """Draws the jaw of fencing pliers opposite the hammer jaw: a curved point for staples sticks
-    out sideways."""
+    """Draws the other jaw of fencing pliers: a curved point for staples sticks out sideways."""
     length, out = j.length_mm, j.tip_width_mm / 2
     back = [
         (start, half),

@@ -143,7 +143,7 @@ def _pushed(polygon: CrossSection, outline: CrossSection, outer: CrossSection) -
     offsets = (corners * normals).sum(axis=1)
 
     def score(candidate: CrossSection) -> float:
-        """Returns the area inside the outline minus the area outside it."""
+        """Returns the candidate's area inside the outline minus its area outside."""
         return float(2 * (candidate ^ outline).area() - candidate.area())
 
     best, best_score = polygon, score(polygon)

@@ -104,8 +104,9 @@ def _lowest_pose(vertices: Array, com: Array) -> StablePose:
 def long_direction_deg(outline: CrossSection) -> float:
     """Returns the direction of an outline's length.
 
-    This is the direction near the principal axis in which most of the outline's edges run. The long
-    edges of a handle therefore count more than a head or a jaw that sticks out to one side.
+    Of the directions near the principal axis, this is the one in which most of the outline's edges
+    run. The long edges of a handle therefore count more than a head or a jaw that sticks out to one
+    side.
 
     Args:
         outline: an outline about 180 mm long.

@@ -29,7 +29,7 @@ USUAL_SIDES = (0.48, 0.95)
 0.5 by 1 m with a margin."""
 
 LONGEST_SIDES = (0.90, 1.20)
-"""The largest sides of any rectangle, in metres. They cover most of the table of 1.0 by 1.5 m."""
+"""The sides of the largest rectangle, in metres. It covers most of the table of 1.0 by 1.5 m."""
 
 _YAWS_DEG = (0, 90, 180, 270)
 _WIDTHS = (1.0, 0.9, 1.1, 0.8, 1.25, 1.45)
@@ -280,8 +280,8 @@ def _fill_strip(
     """
     from scipy import fft
 
-    # The canvas is cyclic, because the Fourier transform is. This margin takes up the keep-out
-    # regions that reach beyond the strip and wrap around.
+    # The Fourier transform is cyclic, so keep-out regions that reach beyond the canvas would wrap
+    # around. Make the canvas larger than the strip, by the largest overhang of such a region.
     overhang = max(
         max(part.solid.shape[axis] - part.size[axis] for axis in (0, 1))
         for rotated in parts

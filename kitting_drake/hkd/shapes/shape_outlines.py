@@ -1,8 +1,8 @@
 """The outlines of the project's twenty flat shapes, in mm.
 
 All are 45 to 75 mm long along x and along y, like the shapes of Ravens' assembling-kits task. Their
-features are wide enough to be seen in the observation o_t, and wider than the notches that a cavity
-bridges.
+features are wide enough to be seen in the observation o_t. Their notches are wide enough for the
+cavities to follow them.
 """
 
 import math

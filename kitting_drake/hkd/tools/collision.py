@@ -93,7 +93,7 @@ def thinned(
 
 
 def _farthest(points: np.ndarray, chosen: list[int], tolerance: float) -> list[int]:
-    """Adds the farthest points to `chosen` until the hull is within the tolerance of all points.
+    """Adds the farthest points to `chosen` until all points are within the tolerance of the hull.
 
     Returns:
         The indices of the chosen points, sorted.

@@ -31,7 +31,7 @@ _DRAKE = "http://drake.mit.edu"
 
 
 def scaled_tool(tool: Tool, length: float) -> Tool:
-    """Scales a tool uniformly to a length in metres; returns it unchanged if it has that length.
+    """Scales a tool uniformly to a length in metres; a tool of this length is returned unchanged.
 
     The scaled tool has its own SDFormat file in the cache, which scales the original's meshes. The
     mass and the grasps are scaled, too; `other_grasps` that become too wide are dropped.
@@ -72,7 +72,7 @@ def scaled_tool(tool: Tool, length: float) -> Tool:
 
 
 def weighted_tool(tool: Tool, mass: float) -> Tool:
-    """Gives a tool another mass in kg; returns it unchanged if it has that mass.
+    """Gives a tool a mass in kg; returns the tool unchanged if it already has this mass.
 
     The distribution of the mass stays the same. The contact stiffness changes with the mass, so
     that the tool rests as before. Grasps in which the tool would turn between the pads come last.

@@ -2,8 +2,8 @@
 
 Lengths are in mm, in the *design frame* of a tool: x along its length with the working end toward
 +x, and z up when the tool lies flat. Each shape is built twice from the same numbers: as an exact
-solid, for its looks and mass; and as many small convex point sets that fill it. `collision.cover`
-merges these point sets into few collision hulls.
+solid, for its looks and mass; and as many small point sets whose convex hulls fill it.
+`collision.cover` merges these point sets into few collision hulls.
 """
 
 import itertools
@@ -65,7 +65,7 @@ class Part:
 
 
 class Shape(NamedTuple):
-    """A solid, and convex point sets, each (n, 3), that fill it."""
+    """A solid, and point sets (n, 3) whose convex hulls fill it."""
 
     solid: Manifold
     hulls: list[np.ndarray]

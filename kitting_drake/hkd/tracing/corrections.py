@@ -25,7 +25,7 @@ class Corrections:
     the corners are found automatically."""
 
     def settles(self, place: tuple[float, float]) -> bool:
-        """Whether the user has checked a place (x, y), in mm: it lies in one of the polygons."""
+        """Whether the user has checked a place (x, y), in mm: whether a polygon covers it."""
         spot = CrossSection.square((0.1, 0.1), True).translate(place)
         return any(
             not (CrossSection([points], FillRule.EvenOdd) ^ spot).is_empty()

@@ -57,7 +57,7 @@ class TraceRequest:
     scale: Scale | None = None
     """An object of known size that is used instead of a sheet."""
     heights_mm: tuple[float, ...] = ()
-    """The tools' heights, from left to right, or one for all. Empty: no correction."""
+    """The tools' heights, from left to right, or one height for all tools. Empty: no correction."""
     edges: str = "upright"
     """One of `tool_height.EDGES`."""
     camera_mm: float | None = None
@@ -227,8 +227,8 @@ def _doubts(
 ) -> list[tuple[Unclear, ...]]:
     """Returns, for each silhouette, the places where it may be wrong.
 
-    These are gaps to close neighbours, and then unclear regions, the largest first. Places that the
-    user has corrected are left out.
+    First come narrow gaps to other silhouettes, then unclear regions, the largest first. Places
+    that the user has corrected are left out.
     """
     near: list[list[Unclear]] = [[] for _ in parts]
     for item in unclear:

@@ -35,8 +35,8 @@ def observed(image: Image, grid: PixelGrid) -> Observation:
     """Makes an observation from a recorded image.
 
     Args:
-        image: (4, rows, cols). An all-black image has no colours, and its unseen pixels must have
-            been filled in. All of its pixels then count as seen.
+        image: (4, rows, cols). If all colours are black, all pixels count as seen. Unseen heights
+            must then have been filled in.
         grid: the pixel grid of the image.
     """
     valid = None if image[:3].any() else np.ones(image.shape[1:], bool)

@@ -83,7 +83,7 @@ class TrainingData:
 
     @property
     def verb(self) -> str:
-        """The verb for making such data, `draw` or `collect`, for messages."""
+        """The verb in messages that ask for more data: `draw` or `collect`."""
         return "draw" if isinstance(self.items, StaticScenes) else "collect"
 
     @property

@@ -36,10 +36,11 @@ _OUTSIDE = 3.0
 """In the search for poses, a pixel of the recess scores 1 inside the region, and minus this
 outside."""
 _NOTCH = 0.3
-"""In the search for poses, a pixel of the recess scores this in a narrow notch of the region."""
+"""In the search for poses, the score of a pixel of the recess that lies in a narrow notch of the
+region."""
 _RIM = 1.5
-"""In the search for poses, the weight of the agreement between the outlines. The mean score of the
-recess's pixels has the weight 1."""
+"""In the search for poses, the weight of the agreement between the outlines, relative to the mean
+score of the recess's pixels."""
 _INSIDE = 0.94
 """The least share of a recess's area that must lie within the region."""
 _NEAR = 0.0025

@@ -149,8 +149,8 @@ class TransporterNetworks(Networks):
         return None if self.rotations is None else self.rotations // 2
 
     def _drawn_scores(self, image: Image, drawn: dict[int, float]) -> Tensor:
-        """Returns the logits (n, rows, cols) of picking at the angles of the n drawn bins, plus
-        their log weights (see `draw_bins`)."""
+        """Returns the logits (n, rows, cols) of picking at the angles of n randomly drawn bins.
+        Each bin's log weight is added (see `draw_bins`)."""
         step = math.tau / self.config.orientations
         scores = [self._pick_scores(image, bin_ * step) + stands for bin_, stands in drawn.items()]
         return torch.stack(scores)

@@ -150,7 +150,7 @@ def _of_table(
 
 def _of_block(who: str, seen: SeenBlock, block: Block) -> list[Finding]:
     length, width, height = scales(seen, block)
-    # Use absolute values, so that opposite errors of length and width do not cancel.
+    # Report the larger of the two errors, whether the side looks too long or too short.
     worst = max(length, width, key=lambda share: abs(share - 1))
     wrong = (worst - 1) * _HALF_KIT
     reason = ""

@@ -43,11 +43,11 @@ _BELOW = 0.5
 """The plane at the calibrated height counts as the table if it has enough pixels: at least this
 fraction of those of every plane below it. Otherwise the plane with the most pixels counts."""
 _ABOVE = 0.08
-"""The same fraction for every plane above it. It is small, because objects may hide most of a
-table."""
+"""The plane at the calibrated height must also have at least this fraction of the pixels of any
+plane above it. The fraction is small, because objects may hide most of a table."""
 _CURVED = 0.5
-"""The depths are probably distances from the camera if conversion from distances to depths reduces
-the table's noise to less than this fraction."""
+"""The depths are probably distances from the camera if their conversion to depths multiplies the
+table's noise by less than this."""
 _FLAT = 0.0005
 """The noise below which a table counts as flat, in metres."""
 

@@ -204,7 +204,7 @@ def _check_depth(frame: Frame, camera: BenchCamera, calibration: Calibration) ->
             "is 1 mm by default"
         )
     else:
-        # `check_table` explains other errors better.
+        # Leave other errors to `check_table`, which explains them better.
         return
     raise CalibrationError(f"{told}: {hint}")
 

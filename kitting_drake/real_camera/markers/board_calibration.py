@@ -38,7 +38,7 @@ class CalibratedCamera:
     """The corners in the first image."""
     images: int
     corners: int
-    """The number of corners in all images."""
+    """The sum of the numbers of corners in the images."""
     fit: BoardFit
 
 

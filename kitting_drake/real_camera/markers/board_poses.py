@@ -28,9 +28,9 @@ _CLEARER = 16.0
 """A pose is ambiguous if another pose fits almost as well: its sum of the corners' squared errors
 is larger by less than this multiple of the error variance of one corner."""
 _LIKELY = 0.2
-"""The test for ambiguous poses assumes an error of the corners of at least this, in pixels."""
+"""The test for ambiguous poses assumes that the corners' error is at least this, in pixels."""
 _NOISE = 0.05
-"""`BoardFit.focal_error` assumes an error of the corners of at least this, in pixels."""
+"""`BoardFit.focal_error` assumes that the corners' error is at least this, in pixels."""
 _WORST = 3.0
 """If the error of the corners exceeds this, in pixels, the intrinsics are probably of another lens,
 or the board moved."""

@@ -107,8 +107,8 @@ def _search(
     """Searches for the best base.
 
     Returns:
-        All bases that were tried, each as x, y, yaw in degrees, and its share of reachable poses;
-        and the best base.
+        A list (x, y, yaw in degrees, share of reachable poses) for each base that was tried; and
+        the best base.
     """
     coarse, fine = _points(grid, _COARSE), _points(grid, _SPACING)
     tried: list[list[float]] = []

@@ -205,7 +205,7 @@ class _Count:
     """Sums over all episodes with one kind of disturbance."""
 
     recovered: int = 0
-    """The number of objects whose action was made to fail, and which were in their cavities in the
+    """The number of `disturbed` episodes in which the affected object was in its cavity in the
     end."""
     disturbed: int = 0
     """The number of episodes in which an object's action was made to fail."""

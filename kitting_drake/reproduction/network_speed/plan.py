@@ -32,7 +32,7 @@ from kitting_drake.reproduction.network_speed.timing import (
 from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
 
 _EXPECTED_SHARE = 0.3
-"""The share of the machine's peak rate that is assumed when times are predicted."""
+"""Predicted times assume that the networks reach this share of the machine's peak rate."""
 
 
 @dataclass(frozen=True)

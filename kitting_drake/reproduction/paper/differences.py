@@ -53,8 +53,9 @@ def differences(results: Mapping[str, Result]) -> list[str]:
 def _means(results: Mapping[str, Result]) -> list[list[str]]:
     """Returns rows with mean differences between SO(2) and the Equivariant Transporter.
 
-    One row is the mean over N of figure 6, if all of its cells exist. The other is the mean over
-    the trainings that both methods have.
+    For each task and number of demonstrations in figure 6, one row has the mean over N, if all of
+    these cells exist. For each task, another row has the mean over the trainings that both methods
+    have, if there are several.
     """
     rows = []
     ours, theirs = LEARNED[:2]

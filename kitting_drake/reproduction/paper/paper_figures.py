@@ -32,8 +32,8 @@ _ROWS = {
 """The rows of table I (method and N), with markers and with colours that the colour-blind can
 distinguish."""
 _ROW_STEP = 0.19
-"""The distance between neighbouring markers with the same number of demonstrations. Groups with
-successive numbers are 1 apart."""
+"""The distance between neighbouring markers with equal numbers of demonstrations. The distance from
+one number of demonstrations to the next is 1."""
 _STYLE = {
     "font.size": 13,
     "axes.edgecolor": "0.5",

@@ -176,8 +176,8 @@ class Queue:
     def _best_rate(self, chosen_by: Training) -> float:
         """Returns the learning rate with the best validation result.
 
-        The training `chosen_by`, which comes from `reference`, runs once with each learning rate.
-        Each result is saved at once, so that no run is repeated.
+        `chosen_by` is a training that `reference` returned. It runs once with each learning rate.
+        The result of each run is saved at once, so that no run is repeated.
         """
         for rate in self._untried(chosen_by):
             try:

@@ -47,7 +47,7 @@ def test_alone_in_raises_if_another_process_has_the_lock(tmp_path: Path):
     told = pytest.raises(UserError, match="another process")
     with alone_in(tmp_path), told, alone_in(tmp_path):
         pass
-    # An exception in the body is not mistaken for a lock.
+    # A BlockingIOError in the `with` block does not mean that the folder is locked.
     with pytest.raises(BlockingIOError), alone_in(tmp_path):
         raise BlockingIOError
     with alone_in(tmp_path):

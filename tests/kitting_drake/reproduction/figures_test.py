@@ -27,7 +27,7 @@ METHODS = {
     "Transporter": "transporter",
 }
 POLICIES = ("so2_small_180_100", "generalist", "shape_matching")
-"""The policies, as in the names of runs, in the order of the columns of docs/robustness.md."""
+"""The policies' names in the names of runs, in the order of the columns of docs/robustness.md."""
 STRICT, OWN = 2, 1
 """The least outcome that counts as a success by the strict measure, and by a task's own."""
 

@@ -67,7 +67,7 @@ def test_learned_makes_the_configured_policy(
     config = Learned(weights_file.name, orientations=orientations, continuous=continuous)
     found = action(config, site, observation())
     networks = load_networks(weights_file, preferred_type())
-    # Without `continuous`, the only stage is the one that may stop; none refines an action.
+    # Without `continuous`, no stage refines an action, but the policy may still stop.
     stages = make_stages(site.planner, insertion=True) if continuous else [StopRule()]
     policy = LearnedPolicy(networks, orientations=orientations, stages=stages)
     assert found == policy(observation())
@@ -166,7 +166,7 @@ def test_a_users_function_and_its_digest(
     assert config.digest(tmp_path) == first
     with pytest.raises(UserError, match="there is no file of the module time"):
         PythonPolicy("time:sleep").digest(tmp_path)
-    # The digest also covers the other modules of its package.
+    # If the module belongs to a package, the digest covers the whole package.
     package = tmp_path / "a_package_of_mine"
     package.mkdir()
     (package / "__init__.py").touch()

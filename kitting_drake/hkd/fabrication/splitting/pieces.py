@@ -72,7 +72,7 @@ def split_block(
         The pieces, or None if the block fits the bed.
 
     Raises:
-        UserError: the bed is too small, or each cut leaves a thin wall.
+        UserError: the bed is too small, or all cuts that were tried leave a thin wall.
     """
     length, width, height = block.bounding_box()[3:]
     if fits((length, width), bed):

@@ -153,8 +153,8 @@ def _as_frame(
     if (
         frame == "tool"
         or box.area.area() < _BOX * sides.prod()
-        # The next two conditions hold if the second curve is the rectangle drawn again, or the
-        # inner side of the rectangle's thick line.
+        # Test whether the second curve is the rectangle again, and then whether it is the inner
+        # side of the rectangle's thick line.
         or box.area.area() < 1.02 * inside.area.area()
         or (box.area.offset(-_LINE_MM, JoinType.Miter) - inside.area).area()
         < 0.001 * box.area.area()

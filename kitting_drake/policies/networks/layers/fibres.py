@@ -63,7 +63,7 @@ class Scalar:
 class Irreps:
     """A direct sum of irreps of SO(2), equation 4 of the paper.
 
-    Even frequencies alone give a field of the quotient SO(2)/C_2.
+    If all frequencies are even, this is a field of the quotient SO(2)/C_2.
     """
 
     frequencies: tuple[int, ...]
