@@ -18,8 +18,8 @@ class Corrections:
     """The sheet's corners, and polygons to add to the traced region or to remove from it."""
 
     steps: tuple[tuple[str, NDArray[np.float64]], ...] = ()
-    """For each polygon: its kind, `add` or `remove`, and its points (n, 2) in mm, as on the rulers
-    of `trace.png`. Polygons are applied in this order."""
+    """The polygons, in the order in which they are applied. Each has a kind, `add` or `remove`, and
+    points (n, 2) in mm, as on the rulers of `trace.png`."""
     corners: NDArray[np.float64] | None = None
     """The sheet's corners (4, 2) in pixels of the photo, counter-clockwise in the picture. None:
     the corners are found automatically."""

@@ -36,7 +36,7 @@ _WARNED_TILT = math.radians(0.65)
 _STEP = 4
 """Only the rows and columns of an image at multiples of this are used."""
 _FARTHEST = 0.35
-"""The distance from the table's height within which planes are searched, in metres."""
+"""Planes are searched for within this distance of the table's height, in metres."""
 _LEAST = 150
 """The least number of used pixels on a plane."""
 _BELOW = 0.5

@@ -21,8 +21,7 @@ _COLOURS = {10: "#009e73", 100: "#d55e00"}
 """Green and orange as in the paper, in shades that the colour-blind can distinguish."""
 _MARKERS = {"so2": "o", "equivariant_transporter": "s", "transporter": "^"}
 _STEP = 0.12
-"""The distance between neighbouring markers with the same N. Groups with successive N are 1
-apart."""
+"""The distance between neighbouring markers with equal N. Markers for successive N are 1 apart."""
 _ROWS = {
     ("so2", 36): ("#e69f00", "o"),
     ("so2", 180): ("#d55e00", "D"),
@@ -32,8 +31,8 @@ _ROWS = {
 """The rows of table I (method and N), with markers and with colours that the colour-blind can
 distinguish."""
 _ROW_STEP = 0.19
-"""The distance between neighbouring markers with equal numbers of demonstrations. The distance from
-one number of demonstrations to the next is 1."""
+"""The distance between neighbouring markers with equal numbers of demonstrations. Markers for
+successive numbers are 1 apart."""
 _STYLE = {
     "font.size": 13,
     "axes.edgecolor": "0.5",
