@@ -154,26 +154,23 @@ class Inventory:
         return self.tries(region) >= _MOST_TRIES
 
     def tries(self, region: Region) -> int:
-        """Returns how many earlier actions moved an object to this region, or failed to move it
-        away. Of several objects, the one with the most actions counts."""
-        counts = [
-            sum(self._is_there(_left_at(attempt), region) for attempt in moves)
-            for moves in self._moves_of(region)
-        ]
-        return max(counts, default=0)
+        """Returns how many earlier actions moved the object that lies in this region to where it
+        lies, or failed to move it away. Of several objects, the one that was left there last
+        counts."""
+        last = (self._moves_of(region) or [[]])[-1]
+        return sum(self._is_there(_left_at(attempt), region) for attempt in last)
 
     def was_removed(self, region: Region) -> bool:
         """Whether earlier actions took an object out of this region, and then placed the same
-        object here again."""
-        for moves in self._moves_of(region):
-            removed = False
-            for attempt in moves:
-                if attempt.outcome != "placed":
-                    continue
-                if attempt.action.aside:
-                    removed |= self._is_there(attempt.action.pick, region)
-                elif removed and self._is_there(attempt.action.place, region):
-                    return True
+        object here again. Of several objects, the one that was left here last counts."""
+        removed = False
+        for attempt in (self._moves_of(region) or [[]])[-1]:
+            if attempt.outcome != "placed":
+                continue
+            if attempt.action.aside:
+                removed |= self._is_there(attempt.action.pick, region)
+            elif removed and self._is_there(attempt.action.place, region):
+                return True
         return False
 
     def balance(self, region: Region) -> NDArray[np.float64] | None:
@@ -185,12 +182,14 @@ class Inventory:
         return None
 
     def _moves_of(self, region: Region) -> list[list[Attempt]]:
-        """Returns the earlier actions on each object that was left in a region, oldest first."""
+        """Returns the earlier actions on each object that was left in a region, oldest first. The
+        object that was left there last comes last."""
         return [moves for moves in self._moves if self._is_there(_left_at(moves[-1]), region)]
 
     @cached_property
     def _moves(self) -> list[list[Attempt]]:
-        """The earlier actions on each object, oldest first.
+        """The earlier actions on each object, oldest first. The object that was moved last comes
+        last.
 
         An action is on the object that was left nearest to its pick, if that is within
         `_SAME_OBJECT`; else on an object that no action was on before.
@@ -198,16 +197,14 @@ class Inventory:
         objects: list[list[Attempt]] = []
         for attempt in self._history:
             pick = attempt.action.pick
-
-            def away(moves: list[Attempt], pick: PlanarPose = pick) -> float:
-                left = _left_at(moves[-1])
-                return math.hypot(left.x - pick.x, left.y - pick.y)
-
-            nearest = min(objects, key=away, default=None)
-            if nearest is not None and away(nearest) < _SAME_OBJECT:
-                nearest.append(attempt)
-            else:
-                objects.append([attempt])
+            moves: list[Attempt] = []
+            if objects:
+                left = [_left_at(item[-1]) for item in objects]
+                away = [math.hypot(pose.x - pick.x, pose.y - pick.y) for pose in left]
+                nearest = int(np.argmin(away))
+                if away[nearest] < _SAME_OBJECT:
+                    moves = objects.pop(nearest)
+            objects.append([*moves, attempt])
         return objects
 
     def _may_contain(self, region: Region, count: int) -> bool:
