@@ -55,8 +55,8 @@ def reach_problem(
 
     Args:
         postures: chooses the arm's postures.
-        stops: the stops of `hand_stops`. The jaws may be turned by half a turn, but only at all
-            stops together.
+        stops: the stops of `hand_stops`. The hand may be turned by half a turn, but then at all
+            stops.
         now: (7) present joint positions, in rad; if None, the middles of the joints' ranges.
     """
     if now is None:

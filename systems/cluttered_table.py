@@ -31,8 +31,8 @@ Points = NDArray[np.float64]
 _CELL = 0.004
 """Side of the squares in which the heights of objects are compared, in metres."""
 _ABOVE = 0.002
-"""In a square, an object counts as above another one if its lowest point is higher than the other's
-highest point, or less than this far below it, in metres."""
+"""A tolerance in metres. In a square, an object counts as above another one if its lowest point is
+higher than the other's highest point minus this."""
 _LEAST_SQUARES = 2
 """An object lies on another one if it counts as above the other in at least this many squares."""
 _FLAT = math.radians(2.5)
@@ -136,12 +136,12 @@ class ClutteredTable:
         ]
 
     def flat_heading(self, index: int, X_WB: RigidTransform) -> float | None:
-        """Returns an object's heading, in radians; None if it does not lie as it would in its
-        cavity.
+        """Returns an object's heading, in radians; None if the object does not lie as it would in
+        its cavity.
 
-        It must lie flat and the right way up, or have rolled without a visible change, as a round
-        handle does. The heading of an object that has rolled is the one at which the flat object
-        would look most similar.
+        The object must lie flat and the right way up. An object that has rolled is accepted, too,
+        if its shape looks the same, for instance a round handle. Its heading is then that of the
+        flat object that looks most similar.
         """
         yaw = heading(X_WB)
         if tilt(X_WB) < _FLAT:
@@ -154,8 +154,8 @@ class ClutteredTable:
         yaws = yaw + np.linspace(-_ROLLED_PITCH, _ROLLED_PITCH, 21)
         deviations = [_deviation(item, points, float(angle)) for angle in yaws]
         best = int(np.argmin(deviations))
-        # If the surfaces are equal, the points of one are about as far from those of the other as
-        # neighbouring points of one surface are from each other.
+        # If the surfaces are equal, the distance between their points is about the spacing of the
+        # points on one surface.
         spacing = float(item.tree.query(item.p_BPoints, k=2)[0][:, 1].mean())
         return float(yaws[best]) if deviations[best] < 1.1 * spacing + _SAME_SHAPE else None
 

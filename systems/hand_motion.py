@@ -170,8 +170,9 @@ def motion_at(
 ) -> NDArray[np.float64]:
     """State, at a given time, of the motion from a start with a given velocity to rest at a goal.
 
-    The motion is the sum of two: braking from the start velocity (see `braking_time`), and for each
-    of the `PARTS` a `travel` over the remaining distance that begins after its delay.
+    The motion is the sum of braking from the start velocity (see `braking_time`) and, for each of
+    the `PARTS`, a `travel` over the remaining distance. Each `travel` begins after the delay of its
+    part.
 
     Args:
         start: (4) position x, y, z, yaw at the start, in m and rad.

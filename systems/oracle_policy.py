@@ -101,11 +101,11 @@ class OraclePolicy(LeafSystem):
 
     The law chooses, in this order:
 
-    1. The goal: the first that is not filled and whose prerequisites are filled or kept. Goals that
-       already have a misplaced object come last. Objects that were tried before come after the
-       others, so that a tool that slips does not use up all actions.
-    2. The object: of those that may fill the goal and fill no other, the highest one, since nothing
-       lies on it. Of equally high ones, the one that `evaluate_placements` assigned to the
+    1. The goal: the first that is not filled and whose prerequisites are filled or kept. Goals
+       whose object was tried less often come first, so that a tool that slips does not use up all
+       actions. Goals that already have a misplaced object come last.
+    2. The object: of the goal's objects that do not fill another goal, the highest one, since
+       nothing lies on it. Of equally high ones, the one that `evaluate_placements` assigned to the
        goal.
     3. The goal pose: of the goal's unoccupied poses, the one that rotates the object least.
     4. The grasp: of those that keep the fingers clear of other objects at the pick and the place,

@@ -62,8 +62,8 @@ class RobotMotion(Protocol):
         """
 
     def back_off(self, state: PlannerState, distance: float) -> None:
-        """Raises the goal of the present mode by a distance. In this mode the hand must move
-        straight."""
+        """Raises the goal of the present mode by a distance. Call it only in a mode in which the
+        hand moves straight."""
 
     def slow_down(self, state: PlannerState, time: float, share: float) -> None:
         """Continues with less acceleration, in this mode and in later ones that move the object.

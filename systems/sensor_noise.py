@@ -68,8 +68,8 @@ class SensorNoiseParameters:
     camera_position_error: float = bounded(0.0, 0.0, 0.1)
     camera_angle_error_deg: float = bounded(0.0, 0.0, 20.0)
 
-    # Size of an error that all cameras share, as if their common mount had moved, in m and in
-    # degrees about the workspace's middle.
+    # Size of a pose error common to all cameras, as if their mount had moved: a shift in m, and a
+    # rotation about the workspace's middle in degrees.
     rig_position_error: float = bounded(0.0, 0.0, 0.1)
     rig_angle_error_deg: float = bounded(0.0, 0.0, 20.0)
 

@@ -19,8 +19,8 @@ _BAND = 0.004
 """A pixel belongs to a plane if its distance from it is less than this, in metres, or less than
 three times the noise."""
 _FITS = 8
-"""Number of fits of the plane. The first half use ever more pixels, the second half only those
-nearest to the plane."""
+"""Number of fits of the plane. In the first half of the fits, the area grows from the middle of the
+grid to all of it. In the second half, only pixels nearer to the plane are used."""
 _LEVEL = 0.0003
 """A table whose deviations are smaller than this, in metres, counts as level."""
 _MOST_OFF, _STEEPEST = 0.010, 0.035

@@ -75,7 +75,8 @@ def camera_pose(
     """
     a, e = np.radians([azimuth_deg, elevation_deg])
     toward = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
-    # The camera's right is horizontal, and is defined even when the camera looks straight down.
+    # The image's rightward direction is horizontal. This also defines it for a camera that looks
+    # straight down.
     right = np.array([-np.sin(a), np.cos(a), 0.0])
     R_WC = RotationMatrix(np.column_stack([right, np.cross(-toward, right), -toward]))
     return RigidTransform(R_WC, target + distance * toward)

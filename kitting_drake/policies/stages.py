@@ -32,7 +32,7 @@ place; see `_AS_GOOD`."""
 _TRIES = 4
 """The policy stops after this many proposals whose pick or place is not seen well enough."""
 _ANOTHER = 0.010
-"""The next pick is farther than this, in metres, from a pick that is not seen well enough."""
+"""If a pick is not seen well enough, the next pick is farther than this from it, in metres."""
 _NOTHING_FITS = 2.0
 """How much the stop threshold is raised if the outlines show nothing to pick, in nats.
 

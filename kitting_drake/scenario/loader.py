@@ -59,8 +59,8 @@ def load_scenario(
     scenario = _load(root[name], Scenario(), f"{path}: {name}", base)
     if perturb is not None:
         overlay = perturbation(perturb, scenario)
-        # The last matching paint wins, but a merge over an existing pattern would keep the
-        # pattern's position. So remove the existing pattern first.
+        # The last matching paint wins. A merge appends new patterns, but would leave an existing
+        # pattern at its position. So remove existing patterns first.
         kept = {
             name: paint
             for name, paint in scenario.appearance.paints.items()

@@ -18,8 +18,7 @@ from kitting_drake.scenario.choosing import ChosenScenario
 _PACKAGES = ("kitting_drake", "systems")
 
 _FILES = Path("files")
-"""The subfolder with links to the scenario's files. The path of a link in it is the absolute path
-of the file on this machine."""
+"""The subfolder with links to the scenario's files; the link to the file `/a/b` is `files/a/b`."""
 
 
 @dataclasses.dataclass(frozen=True)

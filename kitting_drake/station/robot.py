@@ -136,7 +136,7 @@ def _add_arm(parser: Parser, plant: MultibodyPlant, robot: FrankaArm) -> None:
 
 def _add_pedestal(plant: MultibodyPlant, robot: FrankaArm) -> None:
     """Adds a visual pedestal for the arm, from the floor up to its base."""
-    # End 1 mm below the base, so that a table at this height hides the pedestal's top.
+    # End 1 mm below the base: a table at the base's height then hides the pedestal's top.
     height = robot.base[2] - 0.001 - _FLOOR
     if height <= 0:
         return

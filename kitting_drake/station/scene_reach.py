@@ -81,7 +81,7 @@ def _goal_problems(
 
 
 def _first_problem(stops: Iterable[HandStop], motion: ArmMotion) -> str:
-    """Says why an arm cannot reach the first stop; empty if it can reach at least one stop."""
+    """Returns "" if an arm can reach one of the stops; if not, why it cannot reach the first."""
     first = ""
     for stop in stops:
         problem = reach_problem(motion.postures, [stop])

@@ -148,10 +148,11 @@ DENSE = Scenario(task=ToolsetKitting(split="test"), heightmap=Heightmap(resoluti
         (Scenario(random_seed=7, target_realtime_rate=1.0), SEEN, ""),
         (Scenario(task=ToolsetKitting(split="test")), UNSEEN, ""),
         (EASY, None, "`task.success_threshold: 0.01`"),
-        # These tasks have the title of a task of the paper, but differ from it.
+        # The type of the task is that of a task of the paper, but a setting differs.
         (DENSE, None, "`heightmap.resolution: 0.002`"),
         (Scenario(task=ToolsetKitting(split="train")), None, '`task.split: "train"`'),
         (Scenario(task=ToolsetKitting(split="fresh")), None, '`task.split: "fresh"`'),
+        # This is not a task of the paper.
         (Scenario(task=ArrangedKitting()), None, ""),
         (Scenario(task=ArrangedKitting(), time_limit=9.0), None, "`time_limit: 9.0`"),
     ],

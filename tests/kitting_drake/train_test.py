@@ -505,7 +505,7 @@ VALIDATIONS = {
         ),
         "share seed 13",
     ),
-    # With distractors, the tools are the same.
+    # Distractors do not change the tools.
     "the same tables with boxes": (
         range(13, 15),
         dataclasses.replace(ORIGIN, scenario={"task": {"_tag": "!Kitting", "distractors": 4}}),

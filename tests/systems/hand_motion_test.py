@@ -88,9 +88,9 @@ def test_braking_never_reverses_and_keeps_the_limits():
     ("pick", "place", "present", "expected"),
     [
         (0.1, 0.4, 0.0, (0.1, 0.4)),
-        (3.0, -3.0, 0.0, (3.0 - np.pi, np.pi - 3.0)),  # Yaws of -8 and 8 degrees, not 172.
-        (3.0, -3.0, 2.9, (3.0, 2 * np.pi - 3.0)),  # A yaw beyond pi can be nearer.
-        (0.2, 0.2 + np.pi, 0.0, None),  # A half rotation of the object is not skipped.
+        (3.0, -3.0, 0.0, (3.0 - np.pi, np.pi - 3.0)),  # -8 and 8 degrees, not 172.
+        (3.0, -3.0, 2.9, (3.0, 2 * np.pi - 3.0)),  # The place's yaw is beyond pi.
+        (0.2, 0.2 + np.pi, 0.0, None),  # The object must turn by pi.
         (5.0, 11.0, 1.0, None),
         (-np.pi / 2, np.pi, -3.0, None),
     ],

@@ -40,7 +40,7 @@ GRID = PixelGrid()
 
 
 class _Scene:
-    """A box on a table, seen by cameras, each with another pose in its sensor body."""
+    """A box on a table, seen by cameras whose frames are not those of their sensor bodies."""
 
     def __init__(self):
         builder = DiagramBuilder()

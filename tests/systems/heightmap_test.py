@@ -1,4 +1,4 @@
-"""o_t from depth images: which pixels are seen or in view, and how the table is levelled."""
+"""o_t from depth images: pixels that are seen, pixels within the view, and levelling."""
 
 import numpy as np
 import pytest

@@ -47,15 +47,17 @@ class World:
     """The surfaces and the object that the hand touches.
 
     Attributes:
-        touch_pick: the fingertip height at which something is touched on the pick side, in m.
-        touch_place: the same on the place side, where the held object touches, in m.
-        cavity: the lowest and highest yaw of the hand at which the object enters a cavity on the
-            place side, and `touch_place` there.
+        touch_pick: the fingertip height at which the fingertips touch something on the pick side,
+            in m.
+        touch_place: the fingertip height at which the held object touches something on the place
+            side, in m.
+        cavity: (lowest yaw, highest yaw, height). Between these yaws of the hand, the object enters
+            a cavity on the place side, and `height` replaces `touch_place`.
         stiffness: the stiffness of the surfaces, in N/m.
         width: the object's width between the pads in m, by attempt (from 1) and mode.
         levers: by attempt, the distance (m) along the pads from the grasp to the object's centre
             of mass; zero for other attempts.
-        sticks: whether the jaws open only with force.
+        sticks: whether the jaws stick at the release, until a force opens them.
     """
 
     touch_pick: float = NO_TOUCH

@@ -73,9 +73,9 @@ class Report:
     bottom_error_mm: float
     top_error_mm: float
     grip_error_mm: float
-    # How much the position of a gripped face varies along the pads, and how far any part of the
-    # tool between the fingers stands out beyond the gripped faces.
+    # How much the position of a gripped face varies along the pads.
     grip_flatness_mm: float
+    # How far any part of the tool between the fingers stands out beyond the gripped faces.
     finger_overhang_mm: float
     # The tilt of the stable pose relative to the design's pose.
     tilt_deg: float

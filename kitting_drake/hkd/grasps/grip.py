@@ -18,10 +18,10 @@ class Grip:
     `find_grip`)."""
 
     low: float
-    """The least coordinate along the closing direction, measured from the point (x, y) of
-    `find_grip`."""
+    """The surface's least coordinate along the closing direction, measured from the point (x, y)
+    of `find_grip`."""
     high: float
-    """The greatest of these coordinates."""
+    """The surface's greatest coordinate along the closing direction."""
     top: float
     """The greatest height of the surface between the jaws."""
 

@@ -114,7 +114,8 @@ def focal_of_height(homography: Array, height: float, start_px: float, center: A
         center: (2,) the principal point in pixels.
     """
     focal = start_px
-    # Iterate: the camera's height is proportional to the focal length only in a perpendicular view.
+    # Iterate, because the camera's height is proportional to the focal length only if the camera
+    # looks straight at the plane.
     for _ in range(20):
         focal *= height / view_of(homography, focal, center).camera[2]
     return focal

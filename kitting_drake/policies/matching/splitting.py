@@ -33,8 +33,8 @@ _ANGLES = 72
 _STARTS = 5
 """The number of initial poses that are refined for each recess."""
 _OUTSIDE = 3.0
-"""In the search for poses, a pixel of the recess scores 1 inside the region, and minus this
-outside."""
+"""In the search for poses, a pixel of the recess scores 1 if it is inside the region; otherwise it
+scores minus `_OUTSIDE`."""
 _NOTCH = 0.3
 """In the search for poses, the score of a pixel of the recess that lies in a narrow notch of the
 region."""
@@ -44,12 +44,12 @@ score of the recess's pixels."""
 _INSIDE = 0.94
 """The least share of a recess's area that must lie within the region."""
 _NEAR = 0.0025
-"""A point of an object's outline counts as shared if its distance from the region's outline, in
-metres, is less than this."""
+"""A point of an object's outline coincides with the region's outline if the two are less than this
+apart, in metres."""
 _SHARED = 0.45
 """The least fraction of an object's outline points that must be shared (see `_NEAR`)."""
 _COST = 0.0010
-"""The largest mean distance, in metres, of an outline's shared points from the region's outline."""
+"""The largest mean distance of the coinciding points from the region's outline, in metres."""
 _UNEXPLAINED = 0.15
 """If the objects found in a region leave more than this share of its area uncovered, they must all
 agree clearly with the region's outline (`_CLEARLY`)."""
@@ -83,7 +83,7 @@ class _Found:
     shared: float
     """The share of the object's outline that coincides with the region's."""
     cost: float
-    """The mean distance of the shared points from the region's outline, in metres."""
+    """The mean distance of the coinciding points from the region's outline, in metres."""
 
 
 def split_touching(

@@ -177,8 +177,8 @@ class TransporterNetworks(Networks):
         """Predicts f_place over all pixels and, for N up to 36, at all rotations.
 
         For larger N, 36 nearly evenly spaced rotations are evaluated first. The three best peaks
-        are then refined: all bins from the previous to the next of the 36 rotations are evaluated
-        at the pixels near the peak.
+        are then refined: the pixels near a peak are evaluated at all bins between its two
+        neighbours among the 36 rotations.
         """
         shape = (image.shape[1], image.shape[2])
         step = math.tau / orientations

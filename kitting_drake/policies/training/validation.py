@@ -21,8 +21,8 @@ ERRORS = ("pick_mm", "pick_deg", "place_mm", "rotation_deg", "displacement_mm")
 _ARM = 50.0
 """The mean distance of a tool's points from its grasp, in mm; converts angles to displacements."""
 _LOST = 20.0
-"""The largest displacement, in mm. An object counts as lost, with this displacement, if its pick is
-farther than this from the expert's."""
+"""An upper limit of displacements, in mm. If a pick is farther than this from the expert's, the
+object counts as lost and has this displacement."""
 
 
 def prediction_errors(

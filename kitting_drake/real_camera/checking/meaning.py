@@ -17,7 +17,7 @@ GOOD, TIGHT, BAD = "good", "tight", "too much"
 _HALF_KIT = 0.1
 """The distance from a kit's centre to its edge, in metres."""
 _OUT_OF_SCALE = 0.008
-"""A relative error of the scale below this may be noise."""
+"""If the scale's relative error is smaller than this, it may be noise."""
 _HALF_WORKSPACE = 0.5
 """Half the length of the workspace, in metres."""
 _LEVEL = math.radians(0.02)
@@ -28,9 +28,9 @@ _CLEAN = 0.0005
 _NOISY = 0.0016
 """The noise, in metres, above which details of 3 mm are lost."""
 _LOST = 1.8
-"""The height below which details are lost, as a multiple of the noise: two standard deviations of
-the filtered noise. If neighbouring pixels are correlated, filtering leaves nine tenths of the
-noise."""
+"""Details lower than this multiple of the noise are lost. It is 2 * 0.9: a detail must exceed two
+standard deviations of the filtered noise, and the filter leaves nine tenths of a noise that is
+correlated between neighbouring pixels."""
 _FEW_HOLES, _MANY_HOLES = 0.02, 0.10
 
 

@@ -28,7 +28,8 @@ _REFITS = 4
 _LEAST = 100
 """The least number of points of a plane."""
 _STEEP = 1.0
-"""The largest slope of a plane that may be a table seen with a wrong pose."""
+"""The largest slope of a plane that may be the table. If a camera's pose is wrong, the table looks
+sloped."""
 
 
 @dataclass(frozen=True)

@@ -127,10 +127,11 @@ def _predict_angle(networks: Networks, setup: SpeedSetup, n: int) -> Callable[[]
 
 
 def measure_decisions(setup: SpeedSetup) -> list[dict[str, Any]]:
-    """Times whole decisions of exported networks, and their parts.
+    """Times whole decisions of exported networks, and the parts of each decision.
 
     Returns:
-        A row for each method and N. The times of the parts are those of the run with median time.
+        A row for each method and N. The times of the parts are from the run whose total time is the
+        median.
     """
     rows = []
     for method, orientations in _cells(setup.plan):

@@ -99,9 +99,9 @@ TASKS = {
             )
             # Palletizing has eighteen decisions per episode, so few episodes suffice for
             # validation. It has many equally good places, so it takes more steps to learn.
-            # On the pyramid and on align-box-corner, a baseline does better at another learning
-            # rate than that of figure 6. These two tasks therefore have their own learning rates.
-            # Palletizing uses that of the pyramid.
+            # On the pyramid and on align-box-corner, the learning rates of figure 6 are not the
+            # best ones for a baseline. So these two tasks have their own learning rates.
+            # Palletizing uses the rates of the pyramid.
             for name, scenario, episodes, steps, validation, rates_from, earlier in (
                 ("block_insertion", "BlockInsertion", 100, 1000, 24, "unseen", _EARLIER_RELEASE),
                 (

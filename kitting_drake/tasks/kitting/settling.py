@@ -47,8 +47,8 @@ _STILL = 4
 """Bodies are at rest if they pass this many checks in a row, as in `RestDetector`. Velocities are
 not checked, because a flat body on a plane may chatter without changing its place."""
 _POSITION, _ANGLE = 0.0003, 0.01
-"""Bodies pass a check if each pose has changed by less than this, in m and rad, since the last
-failed check."""
+"""Bodies pass a check if, since the last failed check, each has moved by less than `_POSITION`, in
+metres, and turned by less than `_ANGLE`, in radians."""
 
 
 @dataclass(frozen=True)

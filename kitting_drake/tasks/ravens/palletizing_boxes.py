@@ -123,8 +123,8 @@ class PalletizingBoxes(RavensTask):
         placement: Placement,
         records: Sequence[ActionRecord],
     ) -> str:
-        # Compare with the waiting pose, because an object far from the cell may also have fallen
-        # off the table after it appeared.
+        # An object far from the cell may also have fallen off the table after it appeared. So check
+        # that it is near its waiting pose.
         waits = X_WB[index].IsNearlyEqualTo(scene.objects[index].X_WB, 1.0)
         if waits and np.linalg.norm(X_WB[index].translation()) > GONE:
             return NEVER_APPEARED

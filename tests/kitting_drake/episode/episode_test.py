@@ -105,7 +105,7 @@ def test_observers_get_the_modes_in_order(grasp_to_release: tuple[EpisodeResult,
     assert sorted({event.time for event in seen}) == [event.time for event in seen]
     assert [event.is_action_start for event in seen] == [True] + [False] * (len(seen) - 1)
     assert [event.is_stop for event in seen] == [False] * (len(seen) - 1) + [True]
-    # One more event, which is not a mode change, marks the end.
+    # The last event marks the end. It is not a change of mode.
     assert not any(event.is_last for event in seen)
     assert (last.is_last, last.previous, last.mode) == (True, Mode.DONE, Mode.DONE)
     assert not last.is_action_start

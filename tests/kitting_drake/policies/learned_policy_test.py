@@ -194,7 +194,8 @@ def test_a_position_does_not_depend_on_other_peaks():
     np.testing.assert_allclose(expected_position(two, (2, 2)), (2, 2), atol=1e-5)
 
 
-# A window of the place volume: its first bin, its corner pixel, and the label, relative to them.
+# Windows of the place volume: the first bin, the corner pixel (row, col), and the label's position
+# (bin, row, col) in the window.
 PLACEMENTS = [
     (10, (5, 7), (2.3, 3.6, 4.4)),
     (-4, (0, 0), (3.0, 0.0, 0.4)),

@@ -46,7 +46,7 @@ def errors(action: PickPlaceAction) -> tuple[float, float, float]:
         ahead = action.place.theta - action.pick.theta + yaw
         for place in tool["places"]:
             off = math.remainder(ahead - place[2], math.tau / tool["symmetry"])
-            # If the tool lands exactly in this place, the picked point is at `goal`.
+            # The picked point comes to `goal` if the tool lands exactly at `place`.
             goal = turned(local, ahead - off) + place[:2]
             miss = math.dist(goal, (action.place.x, action.place.y))
             found.append((away, miss, abs(off)))

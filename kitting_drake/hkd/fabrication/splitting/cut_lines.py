@@ -332,7 +332,7 @@ def _straightened(points: Line, price: NDArray[np.float64]) -> Line:
     first_free, last_free = min(margin, last), max(last - margin, 0)
     while kept[-1] < last:
         start = kept[-1]
-        # The ends stay perpendicular to the block's sides.
+        # Near its two ends, the cut must stay perpendicular to the block's sides.
         limit = first_free if start < first_free else last_free if start < last_free else last
         end = limit
         while end > start + 1:

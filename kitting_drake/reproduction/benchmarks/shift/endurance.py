@@ -69,7 +69,7 @@ class ShiftScene:
     commit: str | None = None
 
     def cycles(self) -> list[float]:
-        """Returns the time of each unit's cycle, in s."""
+        """Returns, for each unit, the time since the previous unit (or the scene's start), in s."""
         return np.diff(self.unit_seconds, prepend=0.0).tolist()
 
 

@@ -26,9 +26,10 @@ PLANNER = PickPlaceParameters()
 
 
 def heights(heading: float | None, lifted: float = 0.0) -> NDArray[np.float32]:
-    """Heights of a cube to pick and, if there is a heading, of the place's support and neighbours.
+    """Heights of a scene with a cube at the pick.
 
-    The neighbours are cubes on both sides of the place, along the heading.
+    With a heading, there is also a support at the place, and on it two cubes, one on either side of
+    the place along the heading.
     """
     found = np.zeros(GRID.shape, np.float32)
     rows, cols = np.indices(GRID.shape)

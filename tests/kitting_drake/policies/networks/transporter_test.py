@@ -250,7 +250,7 @@ def test_drawn_bins_represent_all_bins():
 @pytest.mark.parametrize(
     ("labels", "rotations", "near", "far"),
     [
-        # With 36 bins, only the bins next to a label are near; all others are far.
+        # Of 36 bins, only those next to a label count as near it; all others count as far.
         ({3, 4}, 9, 2, 5),
         ({3, 4}, 18, 2, 14),
         ({3, 4}, 36, 2, 32),

@@ -28,7 +28,7 @@ def test_without_failed_grasps_nothing_changes():
 
 def test_a_failed_grasp_precedes_at_most_three_of_four_actions():
     assert changeable(summary([GOOD, GOOD, ONE_LOST], 1, actions=12)).text == "0 to 3 of 12"
-    # The episode has two failures. The action that fails second comes after the first failure.
+    # Both failures are in the same episode, so the second one follows a failed grasp.
     assert changeable(summary([[0, 0, 2, 2]], 1, 1, actions=4)).text == "1 to 3 of 4"
 
 

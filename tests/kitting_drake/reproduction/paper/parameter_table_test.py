@@ -19,7 +19,8 @@ def share(method: str, preset: str) -> float:
 def test_the_paper_preset_has_the_authors_sizes():
     found = count_parameters("so2", "paper")
     assert found == pytest.approx(ORIGINAL, rel=1e-3)
-    # The paper gives 4.54 million per network; the authors' angle network has 0.90 at N = 36.
+    # The paper gives 4.54 million per network, but the authors' angle network has 0.90 million at
+    # N = 36.
     theirs = count_parameters("equivariant_transporter", "paper")
     assert [round(theirs[name] / 1e6, 2) for name in COLUMNS] == [4.54, 0.90, 4.54, 4.54]
 

@@ -27,13 +27,13 @@ def visibility(unseen: tuple[slice, slice], *, in_view: bool) -> Visibility:
 @pytest.mark.parametrize(
     ("unseen", "in_view", "theta", "good"),
     [
-        # Pixels within the view are unseen: at the pick; below a finger; beside the turned hand;
-        # in a small part below a finger.
+        # These pixels are in view, but unseen: at the pick; below a finger; at the same position,
+        # but the hand is turned; below a small part of a finger.
         ((slice(78, 83), slice(158, 163)), True, 0.0, False),
         ((slice(75, 86), slice(172, 180)), True, 0.0, False),
         ((slice(75, 86), slice(172, 180)), True, np.pi / 2, True),
         ((slice(79, 81), slice(172, 180)), True, 0.0, True),
-        # Everything under the jaws must be within the view.
+        # These pixels are out of view: one under the jaws; many elsewhere.
         ((slice(80, 81), slice(176, 177)), False, 0.0, False),
         ((slice(110, 160), slice(0, 320)), False, 0.0, True),
     ],
