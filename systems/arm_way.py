@@ -205,8 +205,8 @@ class ArmWay:
         poses = np.array([self._postures.hand_pose(point) for point in path.points])
         yaw = np.unwrap(poses[:, 3])
         fast, middle, slow = way.speeds.tolist()
-        # The speed limit at a point depends on its own height or on the next point's, whichever is
-        # lower.
+        # The speed limit at a point depends on the lower of two heights: the point's and the next
+        # point's.
         below = np.minimum(poses[:, 2], np.append(poses[1:, 2], poses[-1, 2]))
         limit = np.where(below < way.marks[1], slow, np.where(below < way.marks[0], middle, fast))
         high = np.column_stack([np.repeat(limit[:, None], 3, 1), np.full(len(yaw), way.yaw_speed)])

@@ -38,8 +38,8 @@ _LEAST_SQUARES = 2
 _FLAT = math.radians(2.5)
 """An object tilted by less than this, in radians, lies flat."""
 _SAME_SHAPE = 0.0003
-"""Two surfaces count as equal if the mean distance between their points is less than 1.1 times the
-points' spacing plus this, in metres."""
+"""Two surfaces count as equal if the mean distance between their points is less than this, in
+metres, plus 1.1 times the spacing of the points."""
 _ROLLED = math.radians(20.0)
 """Only a tilt of at least this, in radians, counts as caused by rolling."""
 _ROLLED_PITCH = math.radians(10.0)
@@ -114,7 +114,7 @@ class ClutteredTable:
     """For each thing that never moves, points (m, 3) of its surface in the world, in metres."""
     planner: PickPlaceParameters = field(default_factory=PickPlaceParameters)
     ledge: Ledge | None = None
-    """A block. The hand can turn an object over by tipping it across one of its edges."""
+    """A block over whose edges the hand can tip objects to turn them over."""
 
     def points(self, poses: Sequence[RigidTransform]) -> list[Points]:
         """For each object, points (m, 3) of its surface in the world, in metres."""
@@ -308,7 +308,7 @@ def in_the_way(points: Points, gripper: PlanarPose, tip: float, halves: tuple[fl
         points: (m, 3) in the world, in metres.
         gripper: the gripper's pose in the world.
         tip: world z of the fingertips, in metres.
-        halves: half the opening of the jaws that hold the object, and of the open jaws, in metres.
+        halves: half the opening of the jaws, in metres: when they hold the object, and when open.
     """
     along, across = _in_hand(points, gripper)
     along, across, z = np.abs(along), np.abs(across), points[:, 2]

@@ -181,7 +181,7 @@ def motion_at(
         limits: the limits of each of the `PARTS`.
         delays: (3) when the `travel` of each part begins, in s after the start.
         elapsed: time since the start, in s.
-        legs: if given, the legs along z, which replace its single `travel`.
+        legs: if given, the legs along z, which replace the single `travel` along z.
 
     Returns:
         (12) position, velocity, acceleration.

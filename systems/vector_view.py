@@ -60,7 +60,7 @@ class VectorView:
     """Number of elements of the vector."""
 
     def __init_subclass__(cls) -> None:
-        # The fields of a subclass follow those of its base class, whose size it inherits.
+        # At first `cls.size` is the size of the base class, so the new fields follow the base's.
         for field in list(vars(cls).values()):
             if isinstance(field, Number | Array):
                 field.index = cls.size

@@ -280,9 +280,9 @@ def _spread(outline: Outline, recess: Outline, fit: Registration, away: Array) -
 def is_covered(outline: Outline, recess: Outline, fit: Registration) -> bool:
     """Whether, after a fit, all of the recess's outline lies near the object's outline.
 
-    `register` measures distances only from points of the object's outline, and clips them. A box
-    then seems to fit into a longer cavity, or onto the visible remainder of a filled recess.
-    Distances from points of the recess's outline show that such fits are poor.
+    `register` measures distances only from points of the object's outline, and clips them. So a
+    box seems to fit into a longer cavity, or onto the visible remainder of a filled recess. The
+    distances of the recess's points from the object's outline show that such fits are poor.
     """
     return _reverse(outline, recess, fit) < _WORST_REVERSE
 

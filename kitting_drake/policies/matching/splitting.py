@@ -2,7 +2,7 @@
 
 Objects that touch are one region of o_t, whose outline fits no recess. But each recess shows the
 outline of one object. This outline is moved to its best pose within the region, at which it lies
-inside the region and shares much of the region's outline. The object is then cut out there.
+inside the region and coincides with much of the region's outline. The object is then cut out there.
 """
 
 from __future__ import annotations

@@ -38,7 +38,7 @@ def known_model(name: object, where: str) -> str:
     """Returns the distortion model that has a given name in ROS, kalibr or OpenCV.
 
     Raises:
-        UserError: the name is not that of a model in this module.
+        UserError: this module has no model of that name.
     """
     key = str(name or "").strip().lower().replace(" ", "_").replace("-", "_")
     if key not in _MODELS:

@@ -50,7 +50,7 @@ def test_later_picks_are_labels_of_earlier_observations(observed: list[ObservedS
             np.testing.assert_allclose(target.place, (10 + i, 3), atol=1e-9)
             assert target.pick_theta == THETAS[i]
             assert target.rotation == pytest.approx(ROTATION)
-    # Each of the four scenes has the image of its own observation.
+    # The images of the four scenes are those of four different observations.
     heights = [scene.recorded.height[0, 0] for scene in observed]
     assert heights == pytest.approx([0.10, 0.11, 0.12, 0.20])
 
