@@ -1,4 +1,4 @@
-"""Reads off the observation o_t the surface heights that limit the motion of a pick and place."""
+"""Reads the surface heights that limit the motion of a pick and place from an observation o_t."""
 
 from typing import Any
 

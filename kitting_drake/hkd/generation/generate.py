@@ -65,7 +65,7 @@ class Report:
     description: dict[str, Any]
     triangles: int
     collision_hulls: int
-    # How far, at most, the collision outline lies outside and inside the visual outline.
+    # The largest distances of the collision outline from the visual outline, outside and inside it.
     outside_mm: float
     inside_mm: float
     # The lowest point, the highest point and the gripped width of the collision geometry, minus

@@ -17,7 +17,7 @@ TIME_LIMIT = 55.0
 MOST_WAITING = 20.0
 """The longest wall-clock time of one step, as a multiple of `TIME_LIMIT`.
 
-It is long, because it only has to end a process that hangs, and the machine may be busy.
+This time is long, because it only serves to end a process that hangs, and a busy machine is slow.
 """
 _MOST_MEMORY = 12 * 2**30
 

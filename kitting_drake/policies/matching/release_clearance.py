@@ -34,7 +34,7 @@ _UNDER = 0.009
 """Half the side, in metres, of a square around the place. Its highest point is taken as the height
 of the support there."""
 _LEAST = 0.004
-"""An obstacle is higher than the fingertips by more than this, in metres."""
+"""What is higher than the fingertips by more than this, in metres, counts as an obstacle."""
 
 
 def blocked_at_place(

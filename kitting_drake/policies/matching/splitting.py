@@ -47,7 +47,7 @@ _NEAR = 0.0025
 """A point of an object's outline coincides with the region's outline if the two are less than this
 apart, in metres."""
 _SHARED = 0.45
-"""The least fraction of an object's outline points that must be shared (see `_NEAR`)."""
+"""At least this fraction of an object's outline must coincide with the region's outline."""
 _COST = 0.0010
 """The largest mean distance of the coinciding points from the region's outline, in metres."""
 _UNEXPLAINED = 0.15

@@ -33,7 +33,8 @@ _SIDES = (160, 320)
 _MULTIPLE = 16
 """The numbers of rows and columns are multiples of this."""
 _TILTED = math.radians(10)
-"""The largest tilt, in radians, of a plane that may be a table seen with a slightly wrong pose."""
+"""The largest tilt, in radians, of a plane that may be the table. If a camera's pose is slightly
+wrong, the table looks tilted."""
 MOST_TILT = math.radians(1.3)
 """The largest tilt of a table, in radians, that `decide` accepts."""
 _STEP = 2
@@ -262,8 +263,8 @@ def _best_centre(table: Mask, grid: PixelGrid, size: Array, centre: Array, fits:
     """Returns the centre (2,) of the best window, in metres.
 
     The best window is the nearest to the base among those with nearly the largest table area. A
-    window too near the base is chosen only if all others have much less table area. Along an
-    axis along which the whole table fits into the window, `centre` is kept.
+    window too near the base is chosen only if all others have much less table area. If the
+    whole table fits into the window along an axis, `centre` is kept on this axis.
 
     Args:
         table: (rows, cols) the table.

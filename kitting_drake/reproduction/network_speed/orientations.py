@@ -82,7 +82,7 @@ def measure_pick_angles(setup: SpeedSetup, preset: str) -> list[dict[str, Any]]:
 
 
 def _cells(plan: Plan) -> Iterator[tuple[str, tuple[int, ...]]]:
-    """Yields methods, each with the values of N at which the same networks can predict.
+    """Yields methods, each with the values of N at which one set of networks can predict.
 
     A method whose architecture depends on N is yielded for one N at a time.
     """

@@ -126,7 +126,7 @@ def test_one_of_everything():
 
 
 def test_every_variant_of_task_and_policy_is_in_some_scenario():
-    """So every variant is tested: other tests run or build all of these scenarios."""
+    """Other tests run or build all scenarios of these files, so every variant is tested."""
     seen = set()
     for path in (TEST_SCENARIOS, *SCENARIOS.rglob("*.yaml")):
         for key, _ in yaml.compose(path.read_text(), Loader=yaml.SafeLoader).value:

@@ -48,9 +48,9 @@ _OBJECT_SEEN = 0.5
 _RECESS_SEEN = 0.3
 """The least share of a free recess's pixels that must be seen."""
 _GAP = 1.5
-"""The gap between an object and its recess is at most twice this wide, in pixels."""
+"""Half the largest width of the gap between an object and its recess, in pixels."""
 _LEAST_GAP = 0.003
-"""The same limit in metres. The larger of `_GAP` and `_LEAST_GAP` applies."""
+"""Half the largest width of this gap in metres. The larger of `_GAP` and `_LEAST_GAP` applies."""
 _FLAT = 0.0006
 """A pixel agrees with a flat floor if its depth differs from the floor's median depth by less than
 this, in metres, or by less than twice the noise."""

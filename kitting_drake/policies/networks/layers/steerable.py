@@ -260,7 +260,7 @@ def kernel_basis(in_fibre: Fibre, out_fibre: Fibre, size: int) -> Tensor:
 
 
 def frequencies_cutoff(in_fibre: Fibre, out_fibre: Fibre, size: int) -> float | None:
-    """Returns the largest angular frequency of kernels on a ring of pixels, per pixel of radius.
+    """Returns the largest angular frequency of kernels on a ring of pixels, divided by its radius.
 
     A kernel of angular frequency k maps rho_i to rho_j with j up to i + k. With escnn's own limit,
     the highest output frequencies may be unreachable and so always zero. The limit is then raised
@@ -352,8 +352,8 @@ def _multiply_fields(features: Tensor, matrix: Tensor) -> Tensor:
 class BlurPool(nn.Module):
     """Antialiased pooling to every other pixel, from the first to the last.
 
-    A side of 2 n + 1 pixels becomes n + 1, which keeps equivariance to rotations by 90 degrees
-    about the image's centre exact.
+    A side of 2 n + 1 pixels becomes n + 1. So the equivariance to rotations by 90 degrees about the
+    image's centre stays exact.
     """
 
     kernel: Tensor

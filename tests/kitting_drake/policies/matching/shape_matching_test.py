@@ -289,7 +289,7 @@ def kitted(request) -> Observation:
 
 @pytest.mark.slow
 def test_boxes_do_not_match_the_visible_parts_of_filled_recesses(kitted: Observation):
-    """The visible parts are narrow and about as long as a box's side."""
+    """A visible part is narrow and about as long as a box's side, so a box might seem to fit."""
     segmentation = segment(kitted)
     assert segmentation.recesses
     assert len(segmentation.objects) == 4
