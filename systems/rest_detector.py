@@ -63,14 +63,17 @@ def _gaps(
 
     The bound is the widest gap along the six face normals of the two boxes.
     """
+    # Use matrix products where possible: `einsum` takes up to twice as long.
     (R_i, centres_i, halves_i), (R_j, centres_j, halves_j) = first, second
-    apart = centres_i[:, None] - centres_j[None]
-    relative = np.abs(np.einsum("aki,bkj->abij", R_i, R_j))
-    along_i = np.abs(np.einsum("aki,abk->abi", R_i, apart)) - halves_i[:, None]
-    along_i -= np.einsum("abij,bj->abi", relative, halves_j)
-    along_j = np.abs(np.einsum("bkj,abk->abj", R_j, apart)) - halves_j[None]
-    along_j -= np.einsum("abij,ai->abj", relative, halves_i)
-    return np.maximum(along_i.max(axis=2), along_j.max(axis=2))
+    m, n = len(R_i), len(R_j)
+    normals_i, normals_j = R_i.transpose(0, 2, 1), R_j.transpose(0, 2, 1)
+    relative = np.abs(normals_i.reshape(-1, 3) @ normals_j.reshape(-1, 3).T).reshape(m, 3, n, 3)
+    apart = centres_i[:, None] - centres_j
+    along_i = np.abs(normals_i @ apart.transpose(0, 2, 1)) - halves_i[:, :, None]
+    along_i -= np.einsum("aibj,bj->aib", relative, halves_j)
+    along_j = np.abs(normals_j @ apart.transpose(1, 2, 0)) - halves_j[:, :, None]
+    along_j -= np.einsum("aibj,ai->bja", relative, halves_i)
+    return np.maximum(along_i.max(axis=1), along_j.max(axis=1).T)
 
 
 class RestDetector(LeafSystem):
