@@ -314,7 +314,7 @@ def _policy(arguments: argparse.Namespace) -> BenchPolicy:
         ):
             if given:
                 raise UserError(
-                    f"{flag} cannot be combined with --shape_matching: the flag is for networks"
+                    f"{flag} cannot be combined with --shape_matching: {flag} is only for networks"
                 )
         return ShapeMatching(recover=arguments.recover, least_confidence=arguments.least_confidence)
     return load_policy(

@@ -48,7 +48,8 @@ class PixelGrid:
             )
         if self.z_max <= self.z_min:
             raise ValueError(
-                f"z_max of a pixel grid must be above z_min, {self.z_min:g}, not {self.z_max:g}"
+                f"z_max of a pixel grid is {self.z_max:g}, but must be above z_min, which is "
+                f"{self.z_min:g}"
             )
 
     @property

@@ -30,7 +30,7 @@ def test_own_task_example(tmp_path: Path):
     text = (DOCS / "architecture.md").read_text()
     (code,) = re.findall(r"```python\n(import dataclasses\n.+?)```", text, re.DOTALL)
     (tmp_path / "tower.py").write_text(code)
-    (tag,) = re.findall(r"^`(!PythonTask {class: tower:.+})`:$", text, re.MULTILINE)
+    (tag,) = re.findall(r"^`task: (!PythonTask {class: tower:.+})`", text, re.MULTILINE)
     (tmp_path / "tower.yaml").write_text(f"Tower: {{task: {tag}}}")
     scenario = load_scenario(tmp_path / "tower.yaml")
     scene = scenario.task.make_scene(grid=scenario.heightmap.grid(), seed=0, base=tmp_path)

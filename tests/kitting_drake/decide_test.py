@@ -419,7 +419,7 @@ def test_a_frame_with_a_channel_axis_is_refused():
     """Depth images of Drake have a last axis of one channel."""
     frames = cast(TRUE)
     frames["left"] = Frame(frames["left"].color, frames["left"].depth[..., None])
-    with pytest.raises(UserError, match=r"must be \(height, width\), not \(480, 640, 1\)"):
+    with pytest.raises(UserError, match=r"the shape \(height, width\), not \(480, 640, 1\)"):
         decide(frames, TRUE, ShapeMatching())
 
 
@@ -439,7 +439,7 @@ def test_depths_of_32_bits_do_not_overflow(tmp_path: Path):
     ("camera", "grid", "message"),
     [
         ({"max_depth": 0.3}, {}, "no depth is between its min_depth 0.01 and max_depth 0.3"),
-        ({}, {"rows": 1, "cols": 1}, "the workspace is too small for camera"),
+        ({}, {"rows": 1, "cols": 1}, "the workspace is too small"),
     ],
 )
 def test_frames_without_usable_depth_are_refused(

@@ -320,7 +320,7 @@ def test_a_run_is_added_and_removed(folder: Path, monkeypatch: pytest.MonkeyPatc
     # Adding the run again changes nothing. Another run of the same name is refused.
     command(monkeypatch, folder, "--add", "mine", str(evaluated), "--quiet")
     (evaluated / "summary.json").write_text(json.dumps(summary | {"outcomes": []}))
-    with pytest.raises(UserError, match="has another run 'mine': give another name"):
+    with pytest.raises(UserError, match="already has a run 'mine': give another name"):
         command(monkeypatch, folder, "--add", "mine", str(evaluated))
     with pytest.raises(UserError, match=r"'unseen_so2_180_100' does not fit the cell"):
         command(monkeypatch, folder, "--add", "unseen_so2_180_100", str(evaluated))

@@ -106,8 +106,7 @@ def _pose_of_echo(text: str, path: Path) -> FoundPose:
     table[:, 3:] *= np.where(table[:, 3:] @ table[-1, 3:] < 0, -1, 1)[:, None]
     if np.ptp(table, axis=0).max() > _STILL:
         raise UserError(
-            f"{path}: the frame moves between the {len(table)} poses of the file: "
-            "give only one pose"
+            f"{path} has {len(table)} poses of the same frame, which differ: give only one pose"
         )
     calls = set(_ECHO_CALL.findall(text))
     if len(calls) > 1:

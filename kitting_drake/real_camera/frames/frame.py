@@ -35,10 +35,13 @@ def check_frame(frame: Frame, camera: BenchCamera) -> Frame:
         )
     if frame.depth.ndim != 2:
         raise UserError(
-            f"depth of camera {camera.name} must be (height, width), not {frame.depth.shape}"
+            f"depth of camera {camera.name} must have the shape (height, width), not "
+            f"{frame.depth.shape}"
         )
     if frame.color.ndim != 3 or frame.color.shape[2] < 3 or frame.color.dtype != np.uint8:
-        raise UserError(f"colour of camera {camera.name} must be (height, width, 3) of bytes")
+        raise UserError(
+            f"colour of camera {camera.name} must be bytes of the shape (height, width, 3)"
+        )
     if not np.issubdtype(frame.depth.dtype, np.floating):
         raise UserError(f"depth of camera {camera.name} must be floating-point numbers in metres")
     return Frame(frame.color, np.ascontiguousarray(frame.depth, np.float32))

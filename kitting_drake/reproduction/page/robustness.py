@@ -24,7 +24,10 @@ _COLUMNS = {
     "generalist": "generalist",
     "shape_matching": "shape matching",
 }
-_COMPARED = ("generalist minus its unperturbed rate", "generalist minus shape matching")
+_COMPARED = (
+    "generalist minus unperturbed, common seeds",
+    "generalist minus shape matching, common seeds",
+)
 """The paired differences, in percentage points, on the seeds that both runs have."""
 _TRIES = 2
 _FRAMES = 5
@@ -164,7 +167,8 @@ def _needless_table(found: Mapping[Key, Sequence[Run]], labels: Sequence[str]) -
         if label.startswith(("`distractors", "`all"))
         and set(cells := [share((label, method)) for method in _COLUMNS]) != {"-"}
     ]
-    return markdown_table(["perturbation", *_COLUMNS.values()], rows) if rows else ""
+    headings = ["perturbation (actions on objects without cavity)", *_COLUMNS.values()]
+    return markdown_table(headings, rows) if rows else ""
 
 
 def _check_seeds(found: Mapping[Key, Sequence[Run]]) -> None:

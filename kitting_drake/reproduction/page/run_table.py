@@ -64,7 +64,7 @@ def add_run(folder: Path, name: str, summary: Mapping[str, Any]) -> None:
         line = {key: summary[key] for key in _LONG if key in summary}
         if rows.get(name, row) != row or lines.get(name, line) != line:
             raise UserError(
-                f"{folder / TABLE} has another run '{name}': give another name, or remove that "
+                f"{folder / TABLE} already has a run '{name}': give another name, or remove that "
                 f"run first (--remove {name})"
             )
         _write(folder, rows | {name: row}, lines | {name: line})

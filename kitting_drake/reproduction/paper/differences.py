@@ -46,7 +46,9 @@ def differences(results: Mapping[str, Result]) -> list[str]:
     return [
         "### Paired differences\n",
         prose("differences"),
-        markdown_table(["cell", "minus", "strict", "paper's measure"], rows, left_columns=2),
+        markdown_table(
+            ["cell", "compared with", "strict", "paper's measure"], rows, left_columns=2
+        ),
     ]
 
 
@@ -92,11 +94,11 @@ def _rivals(cell: Cell) -> list[tuple[str, str]]:
         return [("trained at N = 180", f"{cell.task}_{training.method}_36_100")]
     if cell.label.startswith(PATIENT) and isinstance(training, Training):
         tail = f"{training.method}_{cell.orientations}_{training.demonstrations}"
-        return [("in the usual number of steps", f"{cell.task}_{tail}{cell.label[len(PATIENT) :]}")]
+        return [("the usual number of steps", f"{cell.task}_{tail}{cell.label[len(PATIENT) :]}")]
     if cell.label == AT_FASTER and isinstance(training, Training):
         tail = f"{cell.orientations}_{training.demonstrations}"
         return [
-            ("at its own learning rate", f"{cell.task}_so2_{tail}"),
+            ("its own learning rate", f"{cell.task}_so2_{tail}"),
             *((METHODS[other], f"{cell.task}_{other}_{tail}") for other in LEARNED[1:]),
         ]
     if cell.label == EVERY_CHANCE and isinstance(training, Training):
@@ -116,7 +118,7 @@ def _rivals(cell: Cell) -> list[tuple[str, str]]:
     if cell.label.startswith("minus"):
         return [("ours, with all extensions", f"{cell.task}_so2_180_100_ours")]
     if cell.label == "ours_recovering":
-        return [("in one try per tool", f"{cell.task}_so2_180_100_ours")]
+        return [("one try per tool", f"{cell.task}_so2_180_100_ours")]
     tail = f"{cell.orientations}_{training.demonstrations}"
     if cell.label:
         return [("ours, as in the paper", f"{cell.task}_so2_{tail}")]

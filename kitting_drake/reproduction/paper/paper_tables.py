@@ -269,7 +269,7 @@ def choose_cells(patterns: Sequence[str]) -> list[Cell]:
         matching = {cell.name: cell for cell in paper_cells() if fnmatch(cell.name, pattern)}
         if not matching:
             raise UserError(
-                f"--cells: no cell matches '{pattern}': docs/protocol.md has names of cells"
+                f"--cells: no cell matches '{pattern}': docs/protocol.md has the cells' names"
             )
         chosen |= matching
     return list(chosen.values())

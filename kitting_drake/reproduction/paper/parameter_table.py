@@ -25,8 +25,9 @@ Transporter, f_pick, is under alpha. The *ratio* compares all networks with thos
 method. For both baselines, our preset `paper` stands for the original.
 
 The presets `small` and `matched` differ in the baselines only. In both, our networks are 25 times
-smaller than the paper's. In `matched`, so is the Transporter, and the pick-angle network (beta) of
-the Equivariant Transporter has about as many parameters as ours.
+smaller than the paper's. In `matched`, the Transporter is also 25 times smaller than its original,
+and the pick-angle network (beta) of the Equivariant Transporter has about as many parameters as
+ours.
 
 The parameters of the originals come from these sources:
 
@@ -90,5 +91,5 @@ def parameters_section() -> str:
             rows.append([METHODS[method], ", ".join(presets), *texts, f"{total:,}", share])
         if method in _ORIGINAL_TEXTS:
             rows.append([METHODS[method], "*original*", *_ORIGINAL_TEXTS[method], ""])
-    headings = ["method", "preset", *COLUMNS, "all", "ratio"]
+    headings = ["method", "preset", *COLUMNS, "all", "ratio to *original*"]
     return f"{_TEXT}\n{markdown_table(headings, rows, left_columns=2)}"

@@ -124,7 +124,7 @@ def _trainings(results: Mapping[str, Result], again: Collection[str]) -> list[st
                 rows.append([METHODS[method], task, *cells, _mean_rates(there)])
     if not rows:
         return []
-    headings = ["method", "toolsets", *(f"seed {seed}" for seed in HEADLINE_SEEDS), "mean"]
+    headings = ["method", "toolsets", *(f"training seed {seed}" for seed in HEADLINE_SEEDS), "mean"]
     return [
         "### Variation between trainings\n",
         prose("trainings"),

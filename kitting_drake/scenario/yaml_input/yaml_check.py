@@ -39,7 +39,7 @@ def check_yaml(schema: Any, value: Any, where: str) -> None:
             check_yaml(typing.get_args(schema)[0], item, f"{where}[{index}]")
     elif origin is dict:
         if not isinstance(value, dict):
-            raise ValueError(f"{where} must be a mapping of names, not {_shown(value)}")
+            raise ValueError(f"{where} must be a mapping from names to values, not {_shown(value)}")
         for key, item in value.items():
             check_yaml(typing.get_args(schema)[1], item, _join(where, key))
     elif struct_fields(schema) is not None:

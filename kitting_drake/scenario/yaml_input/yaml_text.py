@@ -52,7 +52,7 @@ def parse(content: str, where: str) -> dict:
         where: name of the text in error messages.
 
     Raises:
-        UserError: the text is not YAML, or not a mapping of names.
+        UserError: the text is not YAML, or not a mapping from names to values.
     """
     try:
         root = copy.deepcopy(_checked(content))
@@ -70,7 +70,7 @@ def parse(content: str, where: str) -> dict:
     if root is None:
         return {}
     if not isinstance(root, dict):
-        raise UserError(f"{where} must be a mapping of names to values")
+        raise UserError(f"{where} must be a mapping from names to values")
     return root
 
 
@@ -107,10 +107,11 @@ def _check_names(node: yaml.Node | None) -> None:
                 continue
             if key.tag != _TEXT and value.tag == _NULL and not value.value:
                 raise ValueError(
-                    f"'{key.value}' on line {line} has no name: a list needs brackets, as in [1, 2]"
+                    f"'{key.value}' on line {line} looks like an item of a list: a list needs "
+                    "square brackets, as in [1, 2]"
                 )
             if key.tag != _TEXT:
-                raise ValueError(f"the name on line {line} must be a string")
+                raise ValueError(f"the name of the field on line {line} must be a string")
             if key.value == "_tag":
                 raise ValueError(
                     f"'_tag' on line {line} is not a field: write !Name before the value"

@@ -134,7 +134,7 @@ def test_cameras_replace_the_default_ones(tmp_path: Path):
 
 DEEP = "A: {planner: {hom: [0, 0, 0, 0]}}"
 BAD = {
-    # The file is not a mapping of names to scenarios.
+    # The file is not a mapping from names to scenarios.
     "not YAML": ("A: {", ["mine.yaml, line 1", "not YAML"]),
     "a list": ("[1, 2]", ["mine.yaml", "mapping"]),
     "a number": ("5", ["mine.yaml", "mapping"]),
@@ -178,7 +178,7 @@ BAD = {
     "tag before a brace": ("A: {policy: !Oracle}", ["mine.yaml, line 1", "as in !Oracle {}"]),
     "list without brackets": (
         "A: {planner: {home: -0.4, 0, 0.4, 0}}",
-        ["mine.yaml: '0' on line 1 has no name: a list needs brackets, as in [1, 2]"],
+        ["mine.yaml: '0' on line 1 looks like an item of a list: a list needs square brackets"],
     ),
     "empty value": ("A: {time_limit: }", ["time_limit", "empty"]),
     "empty section": ("A: {planner: }", ["planner", "empty"]),

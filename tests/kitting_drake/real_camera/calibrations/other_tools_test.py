@@ -281,7 +281,7 @@ MOVING = texts.TF_ECHO + texts.TF_ECHO.replace("0.500", "0.510")
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (MOVING, "the frame moves between the 2 poses"),
+        (MOVING, "has 2 poses of the same frame, which differ"),
         (
             texts.TF_ECHO.replace(", 0.900]", "]"),
             "three numbers after Translation and four after Quat",

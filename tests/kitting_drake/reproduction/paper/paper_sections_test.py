@@ -161,7 +161,7 @@ def test_a_longer_training_is_compared_with_the_usual_one():
             make_run(f"{ours}_3_times_the_steps_ours", [1.0, 1.0]),
         ]
     )
-    name = f"{ours}_3_times_the_steps_ours", "in the usual number of steps"
+    name = f"{ours}_3_times_the_steps_ours", "the usual number of steps"
     assert rows(text)[name][0] == "+50.0 (+50.0 to +50.0)"
     assert "| 100, 3 times the steps | 100.0" in text
 

@@ -55,7 +55,7 @@ def test_accepts(value: Any):
         ({"by_name": {"a": {"side": "2e-3"}}}, "a number, not '2e-3': write 0.002$"),
         ({"by_name": {"a": {"side": "wide"}}}, "a number, not 'wide'$"),
         ({"by_name": {"a": {"sid": 1.0}}}, r"^by_name\.a\.sid .* did you mean 'side'"),
-        ({"by_name": [1]}, "^by_name must be a mapping of names, not a list"),
+        ({"by_name": [1]}, "^by_name must be a mapping from names to values, not a list"),
         ({"note": "here"}, "^note must be a mapping, not 'here'"),
         ({"count": 2.0}, "^count must be a whole number, not '2.0'"),
         ({"count": False}, "^count must be a whole number, not 'False'"),
