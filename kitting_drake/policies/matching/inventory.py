@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -160,16 +161,17 @@ class Inventory:
         last = (self._moves_of(region) or [[]])[-1]
         return sum(self._is_there(_left_at(attempt), region) for attempt in last)
 
-    def was_removed(self, region: Region) -> bool:
-        """Whether earlier actions took an object out of this region, and then placed the same
-        object here again. Of several objects, the one that was left here last counts."""
+    def was_removed(self, pick: PlanarPose) -> bool:
+        """Whether earlier actions took the object at a pick out of the kit, and then placed it
+        there again."""
+        index = _nearest(self._moves, pick)
         removed = False
-        for attempt in (self._moves_of(region) or [[]])[-1]:
+        for attempt in [] if index is None else self._moves[index]:
             if attempt.outcome != "placed":
                 continue
             if attempt.action.aside:
-                removed |= self._is_there(attempt.action.pick, region)
-            elif removed and self._is_there(attempt.action.place, region):
+                removed |= self._is_on_fixture(attempt.action.pick)
+            elif removed:
                 return True
         return False
 
@@ -196,15 +198,8 @@ class Inventory:
         """
         objects: list[list[Attempt]] = []
         for attempt in self._history:
-            pick = attempt.action.pick
-            moves: list[Attempt] = []
-            if objects:
-                left = [_left_at(item[-1]) for item in objects]
-                away = [math.hypot(pose.x - pick.x, pose.y - pick.y) for pose in left]
-                nearest = int(np.argmin(away))
-                if away[nearest] < _SAME_OBJECT:
-                    moves = objects.pop(nearest)
-            objects.append([*moves, attempt])
+            index = _nearest(objects, attempt.action.pick)
+            objects.append([*([] if index is None else objects.pop(index)), attempt])
         return objects
 
     def _may_contain(self, region: Region, count: int) -> bool:
@@ -224,14 +219,17 @@ class Inventory:
     def _has_filled(self) -> bool:
         """Whether an earlier action placed an object onto the fixture that o_t shows. If so, a
         fixture without visible recesses is a filled kit."""
-        grid, fixture = self.observation.grid, self.segmentation.fixture
-        for attempt in self._history:
-            place = attempt.action.place
-            if attempt.outcome == "placed" and grid.contains((place.x, place.y)):
-                row, col = np.rint(grid.to_pixel((place.x, place.y))).astype(int)
-                if fixture[row, col]:
-                    return True
-        return False
+        return any(
+            attempt.outcome == "placed" and self._is_on_fixture(attempt.action.place)
+            for attempt in self._history
+        )
+
+    def _is_on_fixture(self, pose: PlanarPose) -> bool:
+        grid = self.observation.grid
+        if not grid.contains((pose.x, pose.y)):
+            return False
+        row, col = np.rint(grid.to_pixel((pose.x, pose.y))).astype(int)
+        return bool(self.segmentation.fixture[row, col])
 
     @property
     def _history(self) -> tuple[Attempt, ...]:
@@ -246,6 +244,23 @@ class Inventory:
     def _middle(self, region: Region) -> tuple[float, float]:
         x, y = self.observation.grid.to_world(region.pixels.mean(axis=0))
         return float(x), float(y)
+
+
+def _nearest(objects: Sequence[Sequence[Attempt]], pick: PlanarPose) -> int | None:
+    """Returns the index of the object that was left nearest to a pick; None if none was left within
+    `_SAME_OBJECT`. Of objects that were left at almost the same place, the last one lies on top.
+
+    Args:
+        objects: the actions on each object, oldest first; the object that was moved last comes
+            last.
+        pick: the pick, in the world.
+    """
+    if not objects:
+        return None
+    left = [_left_at(moves[-1]) for moves in objects]
+    away = np.array([math.hypot(pose.x - pick.x, pose.y - pick.y) for pose in left])
+    nearest = int(np.flatnonzero(away < away.min() + _THERE)[-1])
+    return nearest if away[nearest] < _SAME_OBJECT else None
 
 
 def _left_at(attempt: Attempt) -> PlanarPose:

@@ -19,6 +19,7 @@ from kitting_drake.policies.data.images import make_action
 from kitting_drake.policies.matching.inventory import Inventory
 from kitting_drake.policies.matching.jaw_clearance import jaw_grasps
 from kitting_drake.policies.matching.regions.segmentation import Mask, Region, Segmentation
+from kitting_drake.policies.matching.separating import topmost_layers
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import Observation, PickPlaceAction, PlanarPose
 
@@ -55,9 +56,7 @@ def recovery_action(
             pressed = _press(observation, segmentation, region, pickable)
             if not _is_near(pressed.pick, tried):
                 return pressed
-        if inventory.was_removed(region):
-            continue
-        taken = _take_out(observation, segmentation, region, planner, tried)
+        taken = _take_out(inventory, region, planner, tried)
         if taken is not None:
             return taken
     return None
@@ -76,24 +75,26 @@ def _press(
 
 
 def _take_out(
-    observation: Observation,
-    segmentation: Segmentation,
+    inventory: Inventory,
     region: Region,
     planner: PickPlaceParameters,
     tried: Sequence[PlanarPose],
 ) -> PickPlaceAction | None:
     """Returns an action that lays a protruding object on a free part of the table; None if there is
     no such action."""
+    observation, segmentation = inventory.observation, inventory.segmentation
     resolution = observation.grid.resolution
     free = _free_place(segmentation, resolution)
     if free is None:
         return None
     around = ndimage.binary_dilation(region.mask, iterations=_NEARBY) & segmentation.fixture
     top = float(np.median(segmentation.relief[around & ~region.mask]))
-    for grasp in jaw_grasps(segmentation, region, resolution, planner, support=top):
-        action = make_action(observation, grasp.pixel, grasp.theta, free, 0.0)
-        if not _is_near(action.pick, tried):
-            return replace(action, aside=True)
+    # If the region is several entangled objects, often only the topmost can be gripped.
+    for part in (region, *topmost_layers(segmentation, region)):
+        for grasp in jaw_grasps(segmentation, part, resolution, planner, support=top):
+            action = make_action(observation, grasp.pixel, grasp.theta, free, 0.0)
+            if not _is_near(action.pick, tried) and not inventory.was_removed(action.pick):
+                return replace(action, aside=True)
     return None
 
 

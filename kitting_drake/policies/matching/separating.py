@@ -61,7 +61,7 @@ def separating_action(
     failed = failed_pixels(observation.grid, failed_picks)
     strangers = sorted(inventory.worth_a_try, key=lambda item: -item.height)
     for stranger in strangers:
-        for layer in _layers(segmentation, stranger):
+        for layer in topmost_layers(segmentation, stranger):
             grasps = jaw_grasps(segmentation, layer, resolution, planner)
             for grasp in untried(grasps, failed, resolution)[:_GRASPS]:
                 found = _free_pose(segmentation, stranger, layer, grasp.pixel, resolution)
@@ -142,7 +142,7 @@ def _ledges(segmentation: Segmentation, grid: PixelGrid) -> list[Ledge]:
     return found
 
 
-def _layers(segmentation: Segmentation, region: Region) -> list[Region]:
+def topmost_layers(segmentation: Segmentation, region: Region) -> list[Region]:
     """Returns the topmost layers of a region, thinnest first. The last layer is the whole
     region."""
     relief = segmentation.relief

@@ -210,16 +210,3 @@ def test_an_object_on_its_wrong_face_is_turned_over_the_block_s_edge():
     assert min(abs(row - 19.5), abs(row - 109.5), abs(col - 19.5), abs(col - 109.5)) < 8
     assert ShapeMatchingPolicy(PLANNER)(wrong).reason == "nothing fits"
     assert ShapeMatchingPolicy(PLANNER, recover=True)(wrong) == action
-
-
-def test_what_lies_on_a_cleared_place_is_taken_out_but_not_twice():
-    region = Inventory.of(scene((bar(60, 200), 0.015))).segmentation.objects[0]
-    out, back = placed_at((63.0, 220.0), pick=True), placed_at((63.0, 220.0), aside=False)
-    for history, removed in (((out,), False), ((back, out), False), ((out, back), True)):
-        observation = dataclasses.replace(scene((bar(60, 200), 0.015)), history=history)
-        assert Inventory.of(observation).was_removed(region) is removed
-    # An object that was placed there afterwards may be taken out.
-    other = Attempt(PickPlaceAction(PlanarPose(0.6, 0.45), back.action.place), "placed")
-    for history in ((out, other), (out, back, other)):
-        observation = dataclasses.replace(observation, history=history)
-        assert not Inventory.of(observation).was_removed(region)

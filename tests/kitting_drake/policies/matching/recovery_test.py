@@ -1,3 +1,4 @@
+import dataclasses
 import math
 
 import numpy as np
@@ -7,7 +8,7 @@ from kitting_drake.policies.matching.inventory import Inventory
 from kitting_drake.policies.matching.recovery import recovery_action
 from kitting_drake.policies.matching.regions.segmentation import segment
 from systems.pick_place_parameters import PickPlaceParameters
-from systems.signals import Observation, PixelGrid
+from systems.signals import Attempt, Observation, PickPlaceAction, PixelGrid, PlanarPose
 
 GRID = PixelGrid()
 TOP = 0.05
@@ -69,3 +70,41 @@ def test_a_strongly_protruding_object_is_laid_on_the_table(rise: float):
 def test_the_segmentation_measures_the_protrusion():
     (region,) = segment(observed(0.006)).protruding
     assert region.height == pytest.approx(0.006, abs=5e-4)
+
+
+def move(start: tuple[float, float], end: tuple[float, float], *, aside: bool) -> Attempt:
+    """An action that moved an object from one pixel to another."""
+    poses = (PlanarPose(*GRID.to_world(pixel).tolist(), 0.0) for pixel in (start, end))
+    return Attempt(PickPlaceAction(*poses, aside=aside), "placed")
+
+
+def test_an_object_is_not_taken_out_again_after_it_was_put_back():
+    seat, table, elsewhere = (94.0, 100.0), (30.0, 250.0), (140.0, 280.0)
+    put, out, back = (
+        move(elsewhere, seat, aside=False),
+        move(seat, table, aside=True),
+        move(table, seat, aside=False),
+    )
+    other = move(elsewhere, seat, aside=False)
+    for history, gives_up in (
+        ((put,), False),
+        ((put, out, back), True),
+        # Afterwards another object was placed there.
+        ((put, out, other), False),
+        ((put, out, back, other), False),
+    ):
+        observation = dataclasses.replace(observed(0.014), history=history)
+        assert (mending(observation) is None) is gives_up
+
+
+def test_of_entangled_objects_the_topmost_that_can_be_gripped_is_taken_out():
+    height = observed().height.copy()
+    # A bar lies across the block, too long to be gripped where it is wide.
+    height[70:112, 62:138] = TOP + 0.016
+    height[88:94, 96:112] = TOP + 0.034
+    image = np.zeros((4, *GRID.shape), np.float32)
+    image[3] = height
+    action = mending(Observation(image, GRID, np.ones(GRID.shape, bool)))
+    assert action is not None and action.aside
+    row, col = GRID.to_pixel((action.pick.x, action.pick.y))
+    assert 87 < row < 94 and 95 < col < 112
