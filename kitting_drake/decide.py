@@ -166,8 +166,8 @@ def _find(arguments: argparse.Namespace, folder: Path, console: Console) -> None
 
 
 def _check_decided(action: Path) -> None:
-    """Raises UserError if `action.json` exists, but was not written by this command. It may be a
-    person's action for a demonstration."""
+    """Raises UserError if `action.json` exists, but was not written by this command. Such a file
+    may hold a person's action for a demonstration."""
     try:
         record = json.loads(action.read_text())
     except FileNotFoundError:

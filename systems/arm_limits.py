@@ -28,9 +28,9 @@ class VelocityEnvelope:
     """
 
     lower: _Seven
-    """Lower end q_min of each joint's range in the class's formula, in rad."""
+    """q_min of the class's formula: the lower end of each joint's range, in rad."""
     upper: _Seven
-    """Upper end q_max of each joint's range in the class's formula, in rad."""
+    """q_max of the class's formula: the upper end of each joint's range, in rad."""
     offset: _Seven
     """The offset that the class's formula subtracts for each joint, in rad/s."""
     deceleration: _Seven

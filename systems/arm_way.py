@@ -19,7 +19,7 @@ from systems.path_timing import TICK, RowLimits, SmoothMotion, plan_motion
 from systems.vector_view import Array, Number, VectorView
 
 _LINE_POINTS = 17
-"""Number of points, along a straight line of the hand, at which joint positions are computed."""
+"""Number of points at which joint positions are computed for a straight motion of the hand."""
 _SPACING = 0.010
 """Spacing of a path's points, in s: the time that the slowest joint takes from one to the next at
 full speed."""
@@ -182,8 +182,8 @@ class ArmWay:
     def _line(
         self, q: NDArray[np.float64], goal: NDArray[np.float64], points: int = _LINE_POINTS
     ) -> NDArray[np.float64]:
-        """(n, 7) joint positions on a straight line of the hand, up to the first point out of
-        reach."""
+        """(n, 7) joint positions that move the hand in a straight line, up to the first point out
+        of reach."""
         start = self._postures.hand_pose(q)
         way = goal - start
         way[3] = np.remainder(way[3] + np.pi, 2 * np.pi) - np.pi

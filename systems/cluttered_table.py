@@ -154,8 +154,8 @@ class ClutteredTable:
         yaws = yaw + np.linspace(-_ROLLED_PITCH, _ROLLED_PITCH, 21)
         deviations = [_deviation(item, points, float(angle)) for angle in yaws]
         best = int(np.argmin(deviations))
-        # If the surfaces are equal, the distance between their points is about the spacing of the
-        # points on one surface.
+        # A deviation is measured between points, so even for equal surfaces it is about the spacing
+        # of the points on one of them.
         spacing = float(item.tree.query(item.p_BPoints, k=2)[0][:, 1].mean())
         return float(yaws[best]) if deviations[best] < 1.1 * spacing + _SAME_SHAPE else None
 

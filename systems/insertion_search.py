@@ -45,7 +45,7 @@ class InsertionSearch:
     # light force.
     press: float = bounded(0.001, 0.0, 0.01)
 
-    # An object in contact stands on the rim unless its bottom is this far below the rim, in m.
+    # An object in contact stands on the rim unless its bottom is at least this far below it, in m.
     rim_margin: float = bounded(0.0007, 0.0, 0.01)
 
     @property
@@ -75,5 +75,5 @@ class InsertionSearch:
         return rim > table + _LEAST_RIM and bottom > rim - self.rim_margin
 
     def has_slipped_in(self, z: float, touched_at: float) -> bool:
-        """Whether the hand at height z has sunk below its contact height, both in metres."""
+        """Whether the hand, at height z, is clearly below its height at contact; both in metres."""
         return z < touched_at - self.press / 2

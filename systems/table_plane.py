@@ -16,8 +16,8 @@ _BIN = 0.001
 _FAR = 0.03
 """The table is sought within this distance of the bottom of the grid, in metres."""
 _BAND = 0.004
-"""A pixel belongs to a plane if its distance from it is less than this, in metres, or less than
-three times the noise."""
+"""Pixels nearer to a plane than this, in metres, belong to the plane. The limit is three times the
+noise if that is larger."""
 _FITS = 8
 """Number of fits of the plane. In the first half of the fits, the area grows from the middle of the
 grid to all of it. In the second half, only pixels nearer to the plane are used."""

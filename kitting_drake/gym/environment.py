@@ -165,7 +165,7 @@ class KittingEnvironment(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         result = episode.result()
         is_done = result.success_rate > ALL
         if is_done and not episode.is_over:
-            # The task is finished, so stop in place of the agent, as a policy would.
+            # The task is finished. Send a stop on behalf of the agent, as a policy would.
             self._give(episode, PickPlaceAction(stop=True))
             result = episode.result()
             is_done = result.success_rate > ALL

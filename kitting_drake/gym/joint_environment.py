@@ -129,7 +129,8 @@ class JointEnvironment(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32
         high = [float(joint.position_upper_limits()[0]) for joint in joints]
         rates = [float(joint.velocity_upper_limits()[0]) for joint in joints]
         config = self.scenario.controller
-        # At this target opening, closed fingers pull with the largest force (see `FingerLaw`).
+        # With this target opening, fully closed fingers press on each other with the largest force
+        # (see `FingerLaw`).
         tightest = -2 * config.finger_force_limit / config.finger_stiffness
         return (
             np.array([*low, tightest], np.float32),

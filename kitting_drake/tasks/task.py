@@ -120,7 +120,7 @@ class Scene:
     affect neither the reward nor the expert."""
     laying_area: tuple[tuple[float, float], tuple[float, float]] | None = None
     """Lower and upper (x, y) corners, in metres, of the part of the table on which the expert may
-    lay objects that are in the way. None if objects lie apart, so that none is in the way."""
+    lay objects that are in the way. None if the objects lie apart and are never in the way."""
 
     def __post_init__(self) -> None:
         names = [item.name for item in self.objects] + [item.name for item in self.fixtures]

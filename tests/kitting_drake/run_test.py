@@ -237,7 +237,7 @@ Mine:
 
 @pytest.fixture
 def learned(tmp_path: Path) -> Path:
-    """A scenario file whose weights should lie beside it."""
+    """A scenario file that needs a weights file in the same folder, which is not there yet."""
     path = tmp_path / "mine.yaml"
     path.write_text(LEARNED)
     return path

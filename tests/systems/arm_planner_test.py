@@ -23,7 +23,8 @@ WIDTH, FLOOR = 0.02, 0.004
 
 
 class PerfectArm(LeafSystem):
-    """Follows the desired motion, stops the jaws at the object, and feels pads and floor."""
+    """Follows the desired motion, stops the jaws at the object, and measures the contact forces
+    of the pads and the floor."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -56,8 +56,8 @@ def test_a_table_that_is_off_is_levelled(lowered: float):
     assert true.table == (0.0, 0.0, 0.0)
     assert seen.table[2] == pytest.approx(-lowered, abs=5e-4)
     assert np.median(seen.height[seen.height > 0.02]) == pytest.approx(0.03, abs=5e-4)
-    # Motions allow for a table that looks lower. If it looks higher, this counts as a calibration
-    # error.
+    # A table that looks lower may really be lower, so the heights for motions are lowered. One that
+    # looks higher counts as a calibration error.
     pick = PlanarPose(0.45, 0.1)
     found = read_surface_heights(seen, pick, pick)
     assert found.pick_top == pytest.approx(0.03 - max(lowered, 0.0), abs=2e-3)

@@ -170,7 +170,7 @@ def test_the_free_goal_pose_that_rotates_least_is_chosen():
     success = PoseWithin(0.02, 0.3)
     action = ask_boxes([bowls[0], planar(0.3, 0.3, 0.4)], [*goals, *goals], success=success)
     assert action.place.x == pytest.approx(0.6)
-    # The object is placed with the heading of the free bowl's pose, 0.
+    # The heading is 0.4 for the object and 0 for the free bowl, so the object rotates by -0.4.
     assert action.place.theta == pytest.approx(action.pick.theta - 0.4)
 
 

@@ -31,7 +31,8 @@ _FINS = 1.6
 """The limit for thin fins between a notch and its cavity.
 
 The closing in `_notch` fills fins, and a little of the two corners between notch and cavity. A
-notch is rejected if the filled area is more than this many times that of two right-angled corners.
+notch is rejected if the filled area is more than this many times the area that the closing fills at
+two right-angled corners.
 """
 _OVERLAP = 0.001
 """The overlap of a notch with its cavity, in metres, so that no thin skin is left between them."""
@@ -81,7 +82,7 @@ def _best_pair(
     nearer to the grasp.
     """
     single: list[CrossSection] = []
-    # The order of the search is the order of preference, so the first pair is the best.
+    # The search is in the order of preference, so the first pair that fits is the best.
     for radius, slide in itertools.product(RADII, _SLIDES):
         outlines = []
         for centre, outward in _beside(kit, index, cavity, slide):

@@ -38,8 +38,8 @@ class Shaft:
     # cut off straight.
     roundness: float = 0.55
     octagonal: bool = False
-    # The distance by which the handle's middle line bows toward the face. Near its end, the line
-    # bows away from the face by half as much.
+    # The distance by which the handle's middle line bows toward the face. At the handle's lower
+    # end, the line is about half as far off in the other direction.
     bow_mm: float = 0.0
     # The number of grooves in the grip.
     ribs: int = 7

@@ -27,7 +27,7 @@ from kitting_drake.hkd.tools.solids import (
 SHORTEST_MM, LONGEST_MM = 15.0, 350.0
 """The least and the largest length of a part."""
 THINNEST_MM = 4.0
-"""The least height of a part. The lower edges of the jaws' pads stay 1.5 mm above the table."""
+"""The least height of a part: the jaws' pads reach down only to 1.5 mm above the table."""
 WIDEST_MM = 70.0
 """The largest width of a part between the jaws, which open to 80 mm."""
 

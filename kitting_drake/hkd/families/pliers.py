@@ -59,8 +59,8 @@ class PliersParameters:
     steel_material: str = "steel"
     rivet_material: str = "polished_steel"
     grip_material: str = "red_grip"
-    # Other kinds of pliers have `jaws` and `levers`, or `locking`, which replace all fields above.
-    # Each of these is a Jaws, a Levers or a Locking, or a mapping of its fields.
+    # For other kinds of pliers, `jaws` and `levers` together, or `locking` alone, replace all the
+    # fields above. Each of the three may be given as a mapping of its class's fields.
     jaws: Jaws | dict[str, Any] | None = None
     levers: Levers | dict[str, Any] | None = None
     locking: Locking | dict[str, Any] | None = None

@@ -151,8 +151,8 @@ def _draw_length(rng: np.random.Generator) -> float:
 
 
 def _varied(entry: ToolEntry, rng: np.random.Generator) -> ToolEntry:
-    """Returns an entry with random proportions. Parameters missing from the given entry vary from
-    their defaults."""
+    """Returns an entry with random proportions. The parameters vary around the values in the given
+    entry, or around their defaults if the entry lacks them."""
     defaults = DESIGNS[entry.category][0]()
     parameters = {
         key: value for key, value in vars(defaults).items() if isinstance(value, float)

@@ -183,7 +183,8 @@ def _between_fingers(
 def _contact(
     touch_left: NDArray[np.bool_], touch_right: NDArray[np.bool_], at_corner: bool
 ) -> tuple[float, float]:
-    """Returns the mean number of levels at which a pad touches, and the twist.
+    """Returns the number of levels at which a pad touches, averaged over the touching columns and
+    both pads, and the twist.
 
     The twist is the distance along the pads from the right pad's mean point of contact to the left
     pad's, in metres.

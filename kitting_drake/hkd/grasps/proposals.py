@@ -212,7 +212,7 @@ def _search(
 def _proposal(
     hold: Hold, u: float, theta: float, com: Array, planner: PickPlaceParameters
 ) -> GraspProposal:
-    """Makes a proposal, with its penalties, of a hold at which the pads' middle is at `u`."""
+    """Makes a proposal from a hold, and computes its penalties. The pads' middle is at `u`."""
     along, across = jaw_axes(theta)
     x, y = u * along + hold.middle * across
     lever = abs(u - float(com @ along))

@@ -23,8 +23,9 @@ MOST_HULLS = 16
 """The largest number of hulls of a tool. It is exceeded only if the outline needs more hulls at the
 coarsest of `OUTLINE_TOLERANCES_MM`."""
 OUTLINE_TOLERANCES_MM = ((0.26, 0.12), (0.30, 0.2), (0.4, 0.2), (0.6, 0.3), (0.9, 0.3))
-"""Pairs of tolerances of the hulls, for the outline and for the gripped faces, before vertices are
-thinned. A pair is tried if the one before it needs too many hulls."""
+"""Pairs of tolerances: how far the hulls may deviate from the outline, and from the gripped faces.
+If a pair needs too many hulls, the next pair is tried. Thinning the vertices may add to the
+deviations."""
 ADDED_SHARE = 0.05
 """A part is cut in two if its hull adds more than this share of the tool's volume."""
 # The vertices of a hull are thinned with the first tolerance that leaves at most `_MOST_VERTICES`.

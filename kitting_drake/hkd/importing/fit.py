@@ -19,7 +19,8 @@ from systems.grasp import Grasp
 THINNEST_MM, HIGHEST_MM = 4.0, 45.0
 """The least and the largest height of a tool at rest, in mm."""
 
-# The number of other grasps to keep, and how much more than the best grasp they may cost.
+# The number of other grasps to keep. Grasps that cost at least `_MUCH_WORSE` more than the best
+# grasp are left out.
 _OTHERS, _MUCH_WORSE = 3, 2.0
 
 UNITS_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "inches": 25.4}

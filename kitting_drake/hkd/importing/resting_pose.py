@@ -34,7 +34,7 @@ _STEP, _SMALL_STEP = 1 / 128, 1 / 1024
 _SMALL_MM = 60.0
 """The length in mm below which a tool needs a shorter time step.
 
-Such a tool is so light that it would tilt with the usual step.
+Such a tool is so light that it would tilt in a simulation with the usual step.
 """
 _FRICTION = 0.5
 

@@ -21,7 +21,8 @@ _ROUGH = 0.022
 _MOST_FINE = 0.1
 _HOLE_BALL_MM = 0.6
 _STRIP_MM = 1.2
-"""Half the largest width of a strip, in mm. Strips are eroded regions in `_shaded_holes`."""
+"""In `_shaded_holes`, an eroded region is a strip if no part of it is wider than twice this, in
+mm."""
 _EDGE_MM = 2.3
 """The distance by which the ground is extended over the rough pixels at an edge, in mm."""
 _SHINE_STEEP = 0.6
@@ -33,8 +34,8 @@ _SHINY, _SHINY_SHARE = 0.06, 0.25
 brighter than the ground by more than `_SHINY`, in logarithms of light."""
 _SHINE_REACH_MM = 3.0
 _GLARE, _GLARE_SPREADS = 0.025, 5.0
-"""The least brightness of glare above the ground: in logarithms of light, and in standard
-deviations of the ground's light. The larger one counts."""
+"""Glare is brighter than the ground by at least `_GLARE`, in logarithms of light, and by at least
+`_GLARE_SPREADS` standard deviations of the ground's light."""
 _GLARE_REACH_MM, _GLARE_GAP_MM, _GLARE_MM2, _GLARE_SHARE = 8.0, 2.5, 0.7, 0.25
 """Glare up to `_GLARE_REACH_MM` from a tool is added to the tool. A strip between the two is added
 if it is narrower than twice `_GLARE_GAP_MM`. An added region has an area of at least `_GLARE_MM2`,

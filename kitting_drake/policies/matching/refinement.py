@@ -51,12 +51,12 @@ _LARGEST_SHIFT = 0.010
 _LARGEST_ROTATION = math.radians(10)
 """The largest correction of the object's rotation, apart from a half turn, in radians."""
 _LEVER = 0.03
-"""When grasps are compared, a rotation of the jaws by one radian counts as much as a shift by this,
-in metres."""
+"""When grasps are compared, a rotation of the jaws by one radian counts as much as a shift by this
+many metres."""
 _FARTHEST_GRASP = 0.04
 """The largest distance, in metres, of a refined grasp from the predicted one."""
 _POOR = 0.03
-"""When grasps are compared, a grasp cost of one counts as much as a shift by this, in metres."""
+"""When grasps are compared, a grasp cost of one counts as much as a shift by this many metres."""
 _MUCH_WORSE = 0.5
 """A predicted grasp is replaced only if its `JawGrasp.cost` exceeds that of the best grasp nearby
 by at least this."""

@@ -278,9 +278,9 @@ class ReliabilitySummary:
     calibration_error: float
     """The expected calibration error over ten bins."""
     wrong_answers: float
-    """The share of wrong decisions among those above the threshold."""
+    """Of the decisions above the threshold, the share that is wrong."""
     refused: float
-    """The share of right decisions that are below the threshold."""
+    """Of the right decisions, the share that is below the threshold."""
     bins: list[tuple[float, float, int]]
     """For each bin: the mean confidence, the share of right decisions and the number of
     decisions."""

@@ -98,7 +98,7 @@ def over_tools(outcomes: Sequence[Mapping[str, Any]], rate: str) -> Estimate | N
         rate: `STRICT` or `OWN`.
 
     Returns:
-        The estimate; None if fewer than three tools have a failure, or fewer than three a success.
+        The estimate; None if fewer than three tools ever fail, or fewer than three ever succeed.
     """
     needed = 2 if rate == STRICT else 1
     counts: dict[str, list[bool]] = defaultdict(list)

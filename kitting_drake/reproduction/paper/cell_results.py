@@ -43,7 +43,7 @@ class Divided(NamedTuple):
     others: list[Run]
     """The other runs, in their given order."""
     set_aside: list[Run]
-    """All runs from trees with uncommitted changes, including those of cells. No table may use
+    """All runs from trees with uncommitted changes, even if they belong to cells. No table may use
     them."""
 
     @property

@@ -53,7 +53,7 @@ class Task:
     rates_from: str = "unseen"
     """The task on which the baselines' learning rates are chosen."""
     earlier: tuple[str, ...] = ()
-    """Differences from the task's scenario that an older run may have; see `Cell.is_earlier`."""
+    """How scenarios of older runs may differ from the task's scenario; see `Cell.is_earlier`."""
 
 
 TASKS = {
@@ -209,7 +209,7 @@ def reference(training: Training) -> Training:
 
 
 def rates_key(chosen_by: Training) -> str:
-    """Returns the key in `Rates` of a training. The training is a result of `reference`."""
+    """Returns the key in `Rates` of a training that chooses a learning rate (see `reference`)."""
     return f"{chosen_by.task}_{chosen_by.method}"
 
 

@@ -175,7 +175,7 @@ def _palletizing(results: Mapping[str, Result]) -> list[str]:
 
 
 def _pyramid(results: Mapping[str, Result], again: Collection[str]) -> list[str]:
-    """Writes the section on the tasks of `BEYOND_OF_TABLE_1` with extensions."""
+    """Writes the section on the tasks of `BEYOND_OF_TABLE_1`, run with our extensions."""
     if not any(
         f"{task}_so2" in name and name.endswith("_ours")
         for name in results

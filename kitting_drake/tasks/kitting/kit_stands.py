@@ -103,7 +103,7 @@ class KitStand:
         return Fixture(name, _riser_model((length, width, self.riser)), X_WLevel)
 
     def _corners(self, kit: Kit) -> np.ndarray:
-        """(8, 3) how far each corner moves outward as the block tilts, in metres."""
+        """(8, 3): how far the tilt moves each corner outward along each axis, in metres."""
         length, width, height = kit.size
         corners = np.array(
             [(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (0.0, 1.0)]

@@ -298,13 +298,13 @@ def peaks(volume: Tensor, count: int) -> Iterator[tuple[int, int, int]]:
 
 
 def finer_bins(rotation: int, coarse: int, orientations: int) -> tuple[int, int]:
-    """Returns the first and the last of the N bins that cover the range from the previous to the
-    next coarse rotation.
+    """Returns the first and the last fine bin of the range between the two neighbours of a coarse
+    rotation.
 
     Args:
-        rotation: the coarse rotation in the middle of the range, in coarse bins.
-        coarse: the number of coarse bins over a full rotation.
-        orientations: N, the number of orientations in a full turn.
+        rotation: the coarse rotation, in coarse bins.
+        coarse: the number of coarse bins in a full turn.
+        orientations: N, the number of fine bins in a full turn.
     """
     first = math.floor((rotation - 1) * orientations / coarse)
     return first, math.ceil((rotation + 1) * orientations / coarse)

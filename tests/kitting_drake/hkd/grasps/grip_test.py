@@ -28,7 +28,8 @@ def test_coordinates_are_relative_to_the_hand():
 
 
 def test_only_the_surface_between_the_ends_of_the_pads_counts():
-    # The pads reach 8.8 mm or 11.2 mm from their middle. The second bar begins at 10 mm.
+    # The short pads reach 8.8 mm from their middle, the long ones 11.2 mm. The second bar begins at
+    # 10 mm.
     both = np.concatenate([bar(0.0, 0.0), bar(90.0, 0.0) + (0.019, 0, 0)])
     narrow, wide = (find_grip(both, 0.0, 0.0, 0.0, length) for length in (0.0176, 0.0224))
     assert narrow is not None and wide is not None

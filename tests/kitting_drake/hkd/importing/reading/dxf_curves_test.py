@@ -35,7 +35,7 @@ def twice_backwards(space: BaseLayout) -> None:
 
 
 def in_pieces(space: BaseLayout) -> None:
-    """The slot. Parts of it are drawn a second time, in pieces, two of them 0.01 mm off."""
+    """The slot, and four pieces of it drawn a second time. Two of the pieces are 0.01 mm off."""
     slot(space)
     space.add_line((0, 0.01), (70, 0.01))
     space.add_line((70, 0.01), (140, 0.01))
