@@ -331,7 +331,7 @@ def _split(
     """Returns the training and the validation data."""
     everything = read_training_data(path)
     total = everything.count
-    # Validate on a tenth of a given count; without a count, on all data after the training data.
+    # If `count` is given, validate on a tenth as many, else on all data after the training data.
     most_kept = total if count is None else max(1, count // 10)
     if count is None:
         count = total if validation else _most_unrelated(everything, total - max(1, total // 11))

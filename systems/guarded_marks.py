@@ -15,7 +15,7 @@ def guarded_marks(
         parameters: clearances and margins.
 
     Returns:
-        The first height is a margin above all surfaces near the goal. From the second one downwards
+        The first height is above all surfaces near the goal, by a margin. Below the second height,
         contact is expected. Both may be below the goal.
     """
     margin = parameters.slow_margin + state.doubt
@@ -25,7 +25,7 @@ def guarded_marks(
         # Contact is expected only if the hand presses; on the way to a grasp the jaws should touch
         # nothing.
         return first, state.pick_top_z + margin if state.press else state.grasp_z
-    # The first contact is either that of the object with the floor of its place, or that of the
-    # fingertips with the rim beside it. Use the higher one.
+    # First either the object touches the floor of its place, or the fingertips touch the rim beside
+    # the place. Use the higher contact.
     hanging = state.hold_z - state.support_z
     return first, max(state.floor_z + hanging, state.rim_z + state.doubt) + margin

@@ -243,8 +243,8 @@ def _ways(
 
 
 def ramp(start: float, goal: float, rate: float, elapsed: float) -> tuple[float, float]:
-    """Value and rate, at a time since the start, of a ramp with a constant rate that stops at its
-    goal."""
+    """Value and rate of a ramp at the time `elapsed` after its start. The ramp goes from `start` to
+    `goal` at a constant rate, and stops there."""
     distance = goal - start
     travelled = rate * max(elapsed, 0.0)
     if travelled >= abs(distance):

@@ -33,8 +33,8 @@ def object_width(
         top: height of the object's top at the pick, in m.
 
     Returns:
-        The width in m. It is infinite if the object is not seen at the pick, if it is wider than
-            the open jaws, or if something stands where half-open fingers would go down.
+        The width in m; infinite if the object is not seen at the pick or is wider than the open
+            jaws, or if something stands where half-open fingers would go down.
     """
     level = support + _LEVEL * (top - support)
     farthest = MAX_OPENING / 2 + FINGERTIP_DEPTH

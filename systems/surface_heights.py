@@ -13,7 +13,7 @@ _PICK_REACH = 1
 _RIM_REACH = 0.025
 """A rim is searched for within this distance of the place, in metres."""
 _FLOOR_REACH = 2
-"""The floor of the place is measured within this distance of it, in pixels."""
+"""The floor is measured within this distance of the place, in pixels."""
 _PICK_CLEARANCE_REACH = 0.07
 """The open jaws stay within this distance of the pick, in metres."""
 _PLACE_CLEARANCE_REACH = 0.125

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 _STEP = 2
 """Only every second row and every second column is used, to save time."""
 _LEAST = 200
-"""Least number of used pixels that must lie on the table."""
+"""At least this many of the used pixels must lie on the table."""
 _LEAST_SHARE = 0.15
-"""Least share of the seen pixels that must lie on the table."""
+"""At least this share of the used pixels must lie on the table."""
 _BIN = 0.001
 """Width of the bins of the histogram of heights, in metres."""
 _FAR = 0.03

@@ -60,7 +60,7 @@ def is_reproducible(commits: str | None) -> bool:
 
 
 def short_commits(commits: str | None) -> str:
-    """The first eight digits of each commit, with its suffix; `-` if there is none."""
+    """Cuts each commit to eight digits, but keeps the mark of uncommitted changes; `-` for None."""
     found = (commits or "-").split(", ")
     return ", ".join(item[:8] + _UNCOMMITTED * item.endswith(_UNCOMMITTED) for item in found)
 

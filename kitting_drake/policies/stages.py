@@ -34,7 +34,8 @@ _TRIES = 4
 _ANOTHER = 0.010
 """If a pick is not seen well enough, the next pick is farther than this from it, in metres."""
 _NOTHING_FITS = 2.0
-"""How much the stop threshold is raised if the outlines show nothing to pick, in nats.
+"""If the outlines show nothing to pick, the policy stops unless the networks' log-odds exceed the
+stop threshold by at least this, in nats.
 
 Among distractors both the networks and the outlines may be wrong, but seldom at the same time.
 """
@@ -233,8 +234,8 @@ class OutlineStop:
       left.
     - A region that may contain such an object (`Inventory.worth_a_try`) is picked if the networks'
       log-odds that something is left to pick reach the threshold.
-    - Any other object is picked only if the log-odds exceed the threshold by `_NOTHING_FITS` or, in
-      a scene without a fixture, reach the threshold.
+    - Any other object is picked only if the log-odds exceed the threshold by at least
+      `_NOTHING_FITS`. In a scene without a fixture, reaching the threshold is enough.
     - An object that lies upside down, or should not be tried again (`Inventory.is_tried`), is not
       picked.
     """

@@ -59,8 +59,8 @@ class ChosenScenario:
     scenario: Scenario
     path: Path
     name: str
-    """The file's name without its suffix, followed by `:NAME` if a scenario in the file was
-    named."""
+    """The file's name without its suffix. `:NAME` follows if the command line selected one of the
+    file's scenarios by name."""
     text: str | None
     """The YAML that is merged over the scenario."""
     perturbed: str | None = None

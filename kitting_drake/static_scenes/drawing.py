@@ -79,9 +79,9 @@ _RISERS = (0.01, 0.06)
 _MOST_TILT_DEG = 5.0
 """The largest tilt of a kit, in degrees."""
 _FLAT = np.cos(np.radians(2.0))
-"""The cosine of the largest tilt at which a tool lies flat."""
+"""A tool lies flat only if the cosine of its tilt is larger than this."""
 _ON_TABLE = 0.001
-"""The largest distance from the table, in metres, of the origin of a tool that lies flat."""
+"""A tool lies flat only if its origin is less than this above or below the table, in metres."""
 _DEFAULT_VIEWS = 0.4
 """The share of scenes that are seen by the default cameras of scenarios."""
 _WALL = 0.003

@@ -9,7 +9,7 @@ from kitting_drake.scenario.cameras import Camera, LookAt
 _COUNTS = (0.5, 0.25, 0.25)
 """The shares of scenes with one, two and three cameras."""
 _STEEPEST = 60.0
-"""The largest angle of a viewing direction from straight down, in degrees."""
+"""The largest angle between a viewing direction and straight down, in degrees."""
 _DISTANCE = (0.65, 1.1)
 """The range of the distance from a camera to the point that it looks at, in metres."""
 _MIDDLE = (0.5, 0.0)

@@ -193,7 +193,7 @@ def bench(written: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def refusal(bench: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., str]:
-    """Runs `decide` in this process, which must fail; returns its error."""
+    """A function that runs `decide` in this process, expects it to fail, and returns the error."""
 
     def run(*flags: object) -> str:
         arguments = [bench, "--camera", bench / "calibration.yaml", "--output", bench / "out"]

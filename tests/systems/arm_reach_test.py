@@ -72,7 +72,7 @@ def disagreements(limits: ArmLimits, poses: int, seed: int) -> tuple[list[str], 
         yaw = rng.uniform(-math.pi, math.pi)
         stop = HandStop("the pick", x, y, yaw, low=z, high=z, surface=-1.0)
         problem = reach_problem(postures, [stop])
-        # The search ignores collisions: a pose counts as reached if only a collision prevents it.
+        # `search` ignores collisions, so ignore them here, too.
         says = not problem or "collide" in problem
         pose = BASE.to_base([x, y, z, yaw])
         # One search misses some reachable poses: repeat it where the closed form has a solution.

@@ -107,8 +107,8 @@ def test_segments_and_jaws():
         ("RETREAT", None),
     ]
     assert pressed.width_at(pressed.duration)[0] == 0.0
-    # A press may go 20 mm below the object's top. Here that is the table's height, so the press
-    # already ends at the clearance above the table.
+    # A press may go 20 mm below the object's top. Here that would be down to the table, so the
+    # press ends sooner, at the floor clearance.
     motion = ArmMotion(PARAMETERS, FR3, ArmBase())
     lowest = motion.postures.hand_pose(pressed.positions[pressed.segments[1].last])[2]
     assert lowest == pytest.approx(PARAMETERS.floor_clearance, abs=1e-4)

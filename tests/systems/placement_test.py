@@ -225,7 +225,7 @@ def test_a_complete_stage_keeps_its_reward():
     assert complete_stages(goals, half) == frozenset()
     kept = complete_stages(goals, whole)
     assert kept == {0, 1}
-    # A stage that was once complete stays kept after an object has fallen, and is counted once.
+    # A stage that was once complete still counts, once, after one of its objects has fallen.
     assert complete_stages(goals, fallen, kept) == kept
     assert (total_reward(goals, fallen), total_reward(goals, fallen, kept)) == (0.25, 0.5)
     assert total_reward(goals, at(*row, top), kept) == 1.0

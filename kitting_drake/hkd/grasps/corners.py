@@ -16,12 +16,12 @@ LEAST_WIDTH = 0.008
 
 # The depth to which a corner sinks into a pad, in metres.
 _SOFT = 0.0008
-# A corner opposite a face is held if the face touches its pad over at least `_CORNER_MARGIN` (m) on
-# both sides of the corner. Two opposite corners are held if they are offset along the pads by at
-# most `_CORNER_OFFSET` (m).
+# The pads can hold a corner opposite a face if the face touches its pad over at least
+# `_CORNER_MARGIN` (m) on both sides of the corner. They can hold two opposite corners if these are
+# offset along the pads by at most `_CORNER_OFFSET` (m).
 _CORNER_MARGIN, _CORNER_OFFSET = 0.002, 0.0005
-# A taper is held if the slope of its faces along the pads is at most `_TAPER`, measured over
-# `_TAPER_LENGTH` (m).
+# The pads can hold a taper if its faces slope along the pads by at most `_TAPER`. The slope is
+# measured over `_TAPER_LENGTH` (m).
 _TAPER, _TAPER_LENGTH = float(np.tan(np.radians(24.0))), 0.004
 # A corner opposite a face costs `_CORNER_COST`, plus up to `_NOT_FLAT_COST` if the face touches
 # only part of its pad. A taper costs `_TAPER_COST`, plus up to `_SLOPE_COST` for its slope. Two

@@ -26,7 +26,7 @@ SHEETS = {"a4": (297.0, 210.0), "letter": (279.4, 215.9)}
 _ASPECT_ERROR = 0.025
 """The largest `_aspect_error` at which the format of a sheet is recognised."""
 _GIVEN_ASPECT_ERROR = 0.06
-"""The largest `_aspect_error` of a sheet whose size the user gives."""
+"""The largest accepted `_aspect_error` of a sheet whose size the user gives."""
 _FOCALS_35MM = (22.0, 24.0, 26.0, 28.0, 31.0)
 """Typical 35 mm equivalent focal lengths of phones, for photos that do not state theirs."""
 _FOCAL_RANGE_35MM = (18.0, 90.0)

@@ -21,10 +21,9 @@ _ROUGH = 0.022
 _MOST_FINE = 0.1
 _HOLE_BALL_MM = 0.6
 _STRIP_MM = 1.2
-"""In `_shaded_holes`, an eroded region is a strip if no part of it is wider than twice this, in
-mm."""
+"""Half the largest width, in mm, of an eroded region that `_shaded_holes` counts as a strip."""
 _EDGE_MM = 2.3
-"""The distance by which the ground is extended over the rough pixels at an edge, in mm."""
+"""Over the rough pixels at a tool's edge, the ground is extended by at most this far, in mm."""
 _SHINE_STEEP = 0.6
 """The largest slope of the edge of a specular reflection, in logarithms of light per mm."""
 _STEP_REACH_MM = 1.5
@@ -48,7 +47,8 @@ is darker than `_SHADED`, in logarithms of light."""
 _NEUTRAL = 0.05
 """The largest difference in colour between shaded and lit ground, in logarithms of light."""
 _LARGEST_HOLE_MM2 = 500.0
-"""The largest area, in mm^2, of a hole that lies wholly in shadow. A strip may be larger."""
+"""A hole of at least this area, in mm^2, does not count as ground in shadow. A strip may have any
+area."""
 _UNLIKE_SHARE = 0.3
 """At least this share of a tool's pixels differs from the ground."""
 _LEAST_AREA_MM2 = 40.0

@@ -29,7 +29,7 @@ from kitting_drake.hkd.tracing.tool_height import outline_of_silhouette
 from kitting_drake.hkd.tracing.trace_files import outlines_dxf, outlines_svg, trace_png
 
 _STEEPEST = math.radians(30)
-"""The largest angle between the camera's optical axis and the vertical, in radians."""
+"""The largest accepted angle between the camera's optical axis and the vertical, in radians."""
 _MOST_PX_PER_MM = 5.0
 _MOST_PIXELS = 4e6
 _BLURRED_MM = 1.6
@@ -37,7 +37,7 @@ _BLURRED_MM = 1.6
 _HEIGHTS_MM = (0.5, 100.0)
 _CAMERAS_MM = (100.0, 3000.0)
 _SHARE_OF_HEIGHT = 0.5
-"""The largest height of a tool, as a share of the camera's height."""
+"""The largest accepted height of a tool, as a share of the camera's height."""
 _DOUBTED_MM = 0.12
 """An outline is in doubt if the area of its unclear regions, divided by its perimeter, exceeds
 this, in mm."""

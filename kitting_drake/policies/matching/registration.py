@@ -124,7 +124,7 @@ def trace_outline(mask: Mask, resolution: float, *, close: bool = False) -> Outl
     # The outline lies midway between a pixel inside and a pixel outside.
     distance = np.clip(distance - np.sign(distance) * step / 2, -_FARTHEST, _FARTHEST)
     distance = ndimage.gaussian_filter(distance, 1.0).astype(np.float32)
-    # Fine pixel (0, 0) lies at a corner of the coarse pixel `corner`.
+    # The centre of fine pixel (0, 0), the first one in the coarse pixel at `corner`.
     origin = corner - 0.5 + 0.5 / _SUBSAMPLING
     near = np.argwhere(np.abs(distance) < _BAND)
     chosen = near[:: max(1, len(near) // _POINTS)]

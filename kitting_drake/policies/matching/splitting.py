@@ -196,9 +196,9 @@ def _judge(
     relief: NDArray[np.float32],
     resolution: float,
 ) -> _Found | None:
-    """Cuts an object out of a region, by a recess's outline that was fitted to the region. Returns
-    None if the two outlines do not agree well enough, or if something lies across the object's
-    outline."""
+    """Cuts an object out of a region, along a recess's outline that was fitted to the region's
+    outline. Returns None if the two outlines do not agree well enough, or if something lies across
+    the cut."""
     rows, cols = np.indices(region.shape)
     positions = np.stack([rows, cols], axis=-1).reshape(-1, 2)
     back = (positions - fit.shift) @ rotation_matrix(fit.rotation)

@@ -56,7 +56,7 @@ class WeightsFile:
 
 def card_seeds(card: Mapping[str, Any]) -> set[int]:
     """Returns the seeds of all demonstrations for training and validation. If training started from
-    other weights, their seeds are included."""
+    other weights, the seeds of those weights are included."""
     seeds = set(card.get("start_seeds", ()))
     # Seeds of static scenes are not seeds of episodes.
     if card.get("scenario") != STATIC:
@@ -65,8 +65,8 @@ def card_seeds(card: Mapping[str, Any]) -> set[int]:
 
 
 def learned_seeds(card: Mapping[str, Any]) -> dict[str, list[int]]:
-    """Returns the seeds of the training demonstrations by scenario. If training started from other
-    weights, their seeds are included."""
+    """Returns, for each scenario, the seeds of the training demonstrations. If training started
+    from other weights, the seeds of those weights are included."""
     learned = {scenario: set(seeds) for scenario, seeds in card.get("start_learned", {}).items()}
     own = set(card.get("demonstration_seeds", ()))
     scenario = str(card.get("scenario"))

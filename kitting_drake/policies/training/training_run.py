@@ -94,7 +94,8 @@ class Settings:
     start_seeds: tuple[int, ...]
     """All demonstration seeds of the starting weights (see `card_seeds`)."""
     start_learned: dict[str, list[int]]
-    """The training seeds of the starting weights by scenario (see `learned_seeds`)."""
+    """For each scenario, the seeds on which the starting weights were trained (see
+    `learned_seeds`)."""
     device: str
     compute_type: str
 

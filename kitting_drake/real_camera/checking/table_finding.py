@@ -72,11 +72,11 @@ ignored."""
 _TOO_NEAR = 0.25
 """An arm cannot pick within this distance of the middle of its base, in metres."""
 _ENOUGH = 0.6
-"""Workspaces nearer to the base than `_TOO_NEAR` are excluded if a workspace farther away holds
-more than this share of the largest possible table area."""
+"""If a workspace beyond `_TOO_NEAR` holds more than this share of the table area that the fullest
+workspace holds, all nearer workspaces are excluded."""
 _NEARLY = 0.97
-"""Workspaces count as equally good if they hold at least this share of the table area of the best
-one. The nearest of them is chosen."""
+"""A workspace counts as good if it holds at least this share of the table area that the fullest
+remaining workspace holds. The good workspace that is nearest to the base is chosen."""
 
 
 @dataclass(frozen=True)

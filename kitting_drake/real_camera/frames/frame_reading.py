@@ -127,7 +127,7 @@ def _read(sources: _Sources, camera: BenchCamera) -> Frame:
                 raise UserError(
                     f"{path} has no colours: save it with colours, or give a colour image with it"
                 )
-            # The colours already belong to the points, so they need no registration.
+            # A cloud has a colour for each point, so its colours need no registration.
             return Frame(seen, depth)
         return _frame(color, depth, camera, [str(path)] * 2)
     color_path, depth_path = sources
@@ -234,7 +234,7 @@ def _find(folders: Sequence[Path], name: str, alone: bool) -> _Sources:
 def _only(existing: Sequence[Path], folders: Sequence[Path], name: str, number: int) -> Path:
     """Returns the only existing file of a camera; raises UserError if there are none or several.
 
-    For the message, `number` is 0 for colour and 1 for depth.
+    `number` is 0 for a colour file and 1 for a depth file. It is used only for the message.
     """
     if len(existing) != 1:
         word, ending = (("color", ".png"), ("depth", ".npy"))[number]

@@ -47,7 +47,7 @@ class BoardFit:
     angle: float
     """The angle between the board's normal and the line of sight to its middle, in radians."""
     focal_ratio: float
-    """The factor for the focal length that would explain the corners best."""
+    """The corners fit best if the focal length is multiplied by this."""
     focal_error: float
     """The standard deviation of `focal_ratio`."""
 
@@ -139,8 +139,8 @@ def _errors(values: Array, points: Array, pixels: Array, lens: Intrinsics) -> Ar
 
 
 def _focal_ratio(X: Array, points: Array, pixels: Array, lens: Intrinsics) -> tuple[float, float]:
-    """Returns the factor for the focal length that explains the corners best, and its standard
-    deviation."""
+    """Returns the factor by which the focal length must be multiplied to fit the corners best, and
+    the factor's standard deviation."""
     first = np.concatenate([Rotation.from_matrix(X[:3, :3]).as_rotvec(), X[:3, 3], [0.0]])
     if 2 * len(points) <= len(first):
         return 1.0, math.inf

@@ -35,7 +35,7 @@ _NEEDED = 12
 _SHIFT = 0.42
 """The approximate shift of corners by OpenCV's refinement of AprilTags, in pixels."""
 _LEVEL = math.radians(3)
-"""The largest tilt, in radians, of a board that lies on the table."""
+"""The largest accepted tilt, in radians, of a board on the table."""
 _TOUCHED = 0.003
 """The largest accepted error of the distance between touched corners, in metres."""
 _LARGEST = 2.0

@@ -43,7 +43,8 @@ def reliability_table(measured: dict[str, Any]) -> Table:
 
 
 def draw_reliability(measured: dict[str, Any]) -> bytes:
-    """Draws the share of right decisions over their confidence, with the numbers of decisions."""
+    """Draws the share of right decisions against the confidence. Each point shows its number of
+    decisions."""
     figure = Figure(figsize=(8, 4.4), layout="constrained", dpi=130)
     for axes, (policy, name) in zip(
         figure.subplots(1, 2, sharey=True), _NAMES.items(), strict=True

@@ -16,8 +16,8 @@ _RESAMPLES = 10_000
 _TAILS = (2.5, 97.5)
 """The percentiles of a 95 % interval."""
 _FEWEST_TOOLS = 3
-"""A bootstrap over tools is informative if at least this many tools ever fail, and at least this
-many ever succeed."""
+"""A bootstrap over tools is informative if at least this many tools failed at least once, and at
+least this many succeeded at least once."""
 
 STRICT, OWN = "strict_success_rate", "success_rate"
 """The two rates of an episode: of strict success, and of success by the task's own measure."""
@@ -98,7 +98,8 @@ def over_tools(outcomes: Sequence[Mapping[str, Any]], rate: str) -> Estimate | N
         rate: `STRICT` or `OWN`.
 
     Returns:
-        The estimate; None if fewer than three tools ever fail, or fewer than three ever succeed.
+        The estimate; None if fewer than three tools failed at least once, or fewer than three
+            succeeded at least once.
     """
     needed = 2 if rate == STRICT else 1
     counts: dict[str, list[bool]] = defaultdict(list)

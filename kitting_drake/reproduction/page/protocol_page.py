@@ -145,8 +145,8 @@ def _own(summary: dict[str, Any]) -> str:
 
 
 def _most_tested_run(runs: list[Run]) -> list[str]:
-    """Writes tables by category for the run of networks with the most episodes. If no run has
-    networks, all runs are considered."""
+    """Writes tables by category for the run with the most episodes. If there are runs of networks,
+    only these are considered."""
     learned = [run for run in runs if run.method in LEARNED]
     # Do not take the best run, which may be the luckiest of those with few episodes.
     most = max(learned or runs, key=lambda run: (run.summary["episodes"], run.name))

@@ -189,8 +189,7 @@ def scenario_differences(found: dict[str, Any], expected: dict[str, Any]) -> lis
 
 
 def _without(scenario: dict[str, Any], *more: str) -> dict[str, Any]:
-    # The summaries of older versions have no field `robot`, and used the default: the floating
-    # hand.
+    # Older versions did not write the field `robot`. They used the default, the floating hand.
     fields = {"robot": _defaults()["robot"]} | scenario | _translated(scenario.get("plant"))
     if has_unlimited_hand(fields):
         fields["planner"] = _with_present_hand(fields["planner"])

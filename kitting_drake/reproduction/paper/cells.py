@@ -1,4 +1,4 @@
-"""The cells of the paper's tables: how each is trained and evaluated, and which results fit it."""
+"""The cells of the paper's tables: how each is trained and evaluated, and which runs count."""
 
 from __future__ import annotations
 
@@ -314,8 +314,8 @@ class Cell:
             same = summary["policy_digest"] == _loaded(self).policy.digest(SCENARIOS / "paper")
             return None if same else "its weights are not those that come with the package"
         details = self._details(self.policy)
-        # Runs that lack the field avoid_failed_picks did avoid failed picks. The page of results
-        # estimates the effect.
+        # Runs that lack the field avoid_failed_picks did avoid failed picks. Accept these runs: the
+        # page of results says how many actions this can have changed.
         earlier = {"angle_only": False, "avoid_failed_picks": self.avoid_failed_picks}
         found = earlier | {"rotations": None} | summary["policy_details"]
         key = rates_key(reference(self.policy))

@@ -45,7 +45,7 @@ def find_cause(
     """Returns why a tool was not placed, one of `CAUSES`.
 
     - `never picked`: no attempt to grasp the tool was completed.
-    - `missed grasp`: no grasp of the tool held.
+    - `missed grasp`: every attempt to grasp the tool failed.
     - `reversed`: the tool is at its cavity, but rotated by 180 degrees or on the wrong side.
     - `insertion blocked`: the tool is over its cavity, but protrudes or is displaced.
     - `slipped`: the tool was lost on the way, or left outside the kit by a correct action.
@@ -110,7 +110,7 @@ def _is_over_kit(scene: Scene, p_WPoint: np.ndarray) -> bool:
 
 
 def _is_over_one(scene: Scene, kit: int, p_WPoint: np.ndarray) -> bool:
-    """Whether a point is over one kit, given by its index among the scene's fixtures."""
+    """Whether a point is over the kit with the index `kit` among the scene's fixtures."""
     X_KW = scene.fixtures[kit].X_WF.inverse()
     seated = np.concatenate(
         [

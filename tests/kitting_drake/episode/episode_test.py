@@ -1,4 +1,4 @@
-"""Tests of whole episodes. Those of the oracle need no cameras."""
+"""Tests of whole episodes. Episodes of the oracle need no cameras."""
 
 import dataclasses
 import json

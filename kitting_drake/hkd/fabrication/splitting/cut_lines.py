@@ -246,7 +246,7 @@ class _Cutter:
         return (line if axis == 0 else line[:, ::-1]), cost
 
     def _thin(self, regions: Sequence[CrossSection]) -> list[CrossSection]:
-        """Returns thin walls and sharp tips of the pieces that the uncut block does not have."""
+        """Returns thin walls and sharp tips of the pieces, except those of the uncut block."""
         for solid, known in self._levels:
             found = []
             for region in regions:

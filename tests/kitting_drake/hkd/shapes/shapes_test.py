@@ -54,7 +54,7 @@ def test_the_declared_symmetry_is_the_shapes(shape: OutlinedShape):
     outline = about_its_axis(shape)
 
     def other(turn_deg: float) -> float:
-        """The fraction of the rotated shape's area that lies outside the shape."""
+        """The fraction of the rotated shape's area that lies outside the unrotated shape."""
         return float((outline.rotate(turn_deg) - outline).area() / outline.area())
 
     step = 360 / shape.symmetry

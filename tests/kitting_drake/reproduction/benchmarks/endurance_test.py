@@ -123,7 +123,7 @@ def test_a_shift_resumes_and_ends_when_its_hours_are_over(tmp_path: Path, monkey
     assert [scene.seed for scene in run(60 / 3600)] == ran == [7, 8]
     scenes = run(100 / 3600)
     assert [scene.seed for scene in scenes] == ran == [7, 8, 9, 10]
-    # In the same folder, a shorter shift counts only the scenes that it needs.
+    # The folder has four scenes. A shorter shift counts only the first two.
     assert [scene.seed for scene in run(60 / 3600)] == [7, 8]
     measured = summarise_shift(scenes, CHOSEN, 10.0)
     assert measured["units"] == 11 and measured["hours"] == pytest.approx(120 / 3600)
