@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from systems.signals import PlanarPose
 
 _OUTSIDE = (0.15, 0.6)
-"""Least and largest distance of the object's centre of mass beyond the block's edge when the object
-is released, as fractions of the width of the side that rests on the block."""
+"""Range of the distance of the object's centre of mass beyond the block's edge when the object is
+released. The unit is the width of the side that rests on the block."""
 _MOST_OUTSIDE = 0.008
 """Largest distance of the centre of mass beyond the edge, in metres."""
 _BESIDE = 0.005

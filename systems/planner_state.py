@@ -57,11 +57,11 @@ class PlannerState(VectorView):
     width = Number()
     """The width of the object at the pick; infinite if unknown."""
     hold_z = Number()
-    """Height of the fingertips when the jaws finished gripping. `touch_z` is their height when the
-    object touched a cavity's rim."""
+    """Height of the fingertips just after the jaws gripped the object. `touch_z` is the height at
+    which the object touched a cavity's rim."""
     touch_z = Number()
     held_width = Number()
-    """The opening of the jaws when they finished gripping, in m."""
+    """The opening of the jaws just after they gripped the object, in m."""
     gentleness = Number()
     """The fraction of the acceleration limits that is used to move the held object; 0 stands for
     1."""

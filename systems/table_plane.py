@@ -55,9 +55,9 @@ def find_table(
     (row, col, 1)`.
 
     The search starts with a level plane at the lowest peak of the histogram of heights, and refits
-    the plane to the pixels near it. The result is zero if the plane deviates by less than 0.3 mm
-    from the bottom of the grid, if it is too far off or too steep for a calibration error, or if no
-    plane is found.
+    the plane to the pixels near it. The result is (0, 0, 0) if no plane is found, or if the plane
+    deviates by less than 0.3 mm from the bottom of the grid, or by more than a calibration error
+    can explain.
 
     Args:
         height: (rows, cols) heights in metres above the bottom of the grid; may be negative.

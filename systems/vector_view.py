@@ -60,7 +60,7 @@ class VectorView:
     """Number of elements of the vector."""
 
     def __init_subclass__(cls) -> None:
-        # At first `cls.size` is the size of the base class, so the new fields follow the base's.
+        # Before this loop, `cls.size` is that of the base class. So new fields follow the base's.
         for field in list(vars(cls).values()):
             if isinstance(field, Number | Array):
                 field.index = cls.size

@@ -123,7 +123,7 @@ class Workers(Protocol):
     cluster."""
 
     def capacity(self) -> int:
-        """The number of calls that can run at present; at least 1."""
+        """The number of calls that can run at the same time; at least 1. It may change."""
 
     def run(self, function: Callable[..., _Result], *arguments: object) -> _Result | ProcessCrashed:
         """Calls a function in a process, as `Subprocess.call` does. This method is thread-safe.

@@ -183,8 +183,8 @@ def counted_objects(episodes: Sequence[Episode]) -> list[list[Entry]]:
     """The objects of each episode that count: those for which a goal was left.
 
     In a failed or timed-out episode no object is a success or has errors. If the episode's process
-    died, its objects may be unknown. Then failed objects are counted instead. Their number in each
-    category is the largest number in any episode.
+    died, its objects may be unknown. Such an episode gets failed objects: in each category, the
+    largest number in any episode.
     """
     found = [
         [item for item in episode["objects"] if item["add_s_mm"] is not None]

@@ -178,9 +178,9 @@ def _decision(draft: Draft) -> Decision:
 
 
 def _left_over(draft: Draft) -> LeftOver | None:
-    """Returns the objects and recesses that a stopping policy still sees.
+    """Returns the objects and recesses that the policy still sees when it stops.
 
-    Returns None if the policy continues, or does not use outlines.
+    Returns None if it does not stop, or does not use outlines.
     """
     return draft.look.inventory.left_over if draft.stop and draft.outlined else None
 

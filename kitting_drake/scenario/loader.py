@@ -139,9 +139,8 @@ def _onto(raw: dict, defaults: Scenario) -> tuple[dict, Scenario]:
 def _without_mappings(given: dict, current: Task) -> Task:
     """Returns the task onto which `given` is merged.
 
-    If `given` has the type of `current`, this is `current`. Otherwise it is the default task of
-    the given type. The mappings of this task that `given` also has are emptied, so that `given`
-    replaces them.
+    This is `current`, unless `given` has another type. Then it is the default task of that type.
+    Mappings in the default task are emptied if `given` has them too, so that `given` replaces them.
     """
     for variant in typing.get_args(Task):
         if variant is PythonTask:

@@ -96,7 +96,7 @@ def test_wall_clock_times_of_all_runs_add_up(tmp_path: Path, monkeypatch: pytest
     with pytest.raises(KeyboardInterrupt):
         total(0, 1, 2)
     now += 7000.0
-    # The time of a run that was stopped counts up to its last episode.
+    # If a run was stopped, only the time up to the end of its last episode counts.
     assert total(0, 1) == 100.0
     (tmp_path / "wall_seconds.json").write_text("{")
     with pytest.raises(UserError, match=r"wall_seconds\.json is damaged: delete it"):

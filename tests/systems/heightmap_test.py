@@ -34,8 +34,8 @@ def test_pixels_outside_all_images_are_out_of_view():
     seen = project([flat(focal=900.0)], GRID)
     assert 0.1 < seen.in_view.mean() < 0.7
     assert seen.valid[seen.in_view].mean() > 0.99
-    # A pixel counts as in view if a camera would see the table there. A high box may be seen where
-    # the table would not be.
+    # A pixel is in view if a camera would see the bare table there. Outside the view, the top of a
+    # high box may be visible.
     assert seen.valid[~seen.in_view].mean() < 0.03
     middle = tuple(np.rint(GRID.to_pixel((0.5, 0.0))).astype(int))
     assert seen.in_view[middle]

@@ -25,8 +25,8 @@ _CELL = 0.0007
 _FARTHEST = 0.03
 """The largest distance of a label from its cavity, in metres."""
 _PLAINLY = 1.5
-"""A label must be more than this many times as far from any other tool's cavity as from the cavity
-of its own tool."""
+"""A label's distance from any other tool's cavity must exceed its distance from its own tool's
+cavity by this factor."""
 # The cost of a label beside its cavity, in metres, is the sum of: the label's distance from the
 # cavity; a tenth of its distance from the cavity's middle; 6 mm if the text is rotated; and minus
 # 6 times the height of its letters.

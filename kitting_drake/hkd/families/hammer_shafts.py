@@ -166,8 +166,8 @@ def _loft(s: Shaft, top: float, stations: list[tuple[float, float, float]]) -> S
 
 
 def _bow(s: Shaft, u: float) -> float:
-    """Returns the offset of the middle line toward the face, in mm, at the distance of `u` handle
-    lengths from the upper end."""
+    """Returns the offset of the middle line toward the face, in mm. `u` is the distance from the
+    handle's upper end, as a share of the handle's length."""
     t = max(0.0, (u - 0.36) / 0.64)
     return s.bow_mm * (np.sin(np.pi * min(1.0, 1.25 * t)) * 1.0 - 1.2 * max(0.0, t - 0.55))
 

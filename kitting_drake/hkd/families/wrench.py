@@ -212,7 +212,7 @@ def _panel(p: WrenchParameters, side: int) -> Manifold:
             0.95 * half_start,
         )
     top = p.shank_thickness_mm / 2
-    # Bevel the panel, which gives it sloped walls as forging does.
+    # The bevel slopes the panel's walls, as on a forged wrench.
     if p.panel_depth_mm > 0:
         panel = plate(outline, top - p.panel_depth_mm, top + 4.0, 0.6).solid
     else:

@@ -65,7 +65,8 @@ class Report:
     description: dict[str, Any]
     triangles: int
     collision_hulls: int
-    # The largest distances of the collision outline from the visual outline, outside and inside it.
+    # The largest distances by which the collision outline exceeds the visual outline, and by which
+    # it falls short.
     outside_mm: float
     inside_mm: float
     # The lowest point, the highest point and the gripped width of the collision geometry, minus

@@ -192,8 +192,8 @@ class _Warp:
     """The factor of the width is 1 + splay at the end toward +x, 1 in the middle, and 1 - splay at
     the other end."""
     bend: Array
-    """The sideways offset is bend[0] u^2 + bend[1] u^3, in half lengths of the tool. At the ends of
-    the tool, u is -1 and 1."""
+    """The sideways offset is bend[0] u^2 + bend[1] u^3. The unit of the offset and of u is half the
+    tool's length, so u is -1 and 1 at the ends of the tool."""
 
     @classmethod
     def draw(cls, solid: Manifold, rng: np.random.Generator) -> "_Warp":

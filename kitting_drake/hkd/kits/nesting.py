@@ -213,7 +213,7 @@ class _Part:
         return self._spectra[canvas]
 
     def on_canvas(self, mask: Mask, canvas: tuple[int, int], place: tuple[int, int]) -> Mask:
-        """Puts a mask on a cyclic canvas, with its `inset` corner at `place` (row, column)."""
+        """Puts a mask on a cyclic canvas. The mask's cell `inset` is at `place` (row, column)."""
         result = np.zeros(canvas, dtype=bool)
         result[: mask.shape[0], : mask.shape[1]] = mask
         return np.roll(result, (place[0] - self.inset[0], place[1] - self.inset[1]), axis=(0, 1))

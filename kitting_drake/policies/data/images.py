@@ -23,8 +23,8 @@ _CURVATURE_STD = 0.2
 """The standard deviation of each of the two coefficients of a random curvature (see
 `curved_crop`)."""
 _FARTHEST_CURVED = 1.4
-"""The distance from the pick beyond which the displacements of a curved crop stop growing, in half
-sides of the crop. The crop's corners are about this far from the pick."""
+"""The distance from the pick beyond which the displacements of a curved crop stop growing. The unit
+is half the crop's side, so the crop's corners are about this far from the pick."""
 _ROTATION_STD = math.radians(60)
 """The standard deviation of augmentation's rotations in radians, as in the authors' code."""
 _SHIFT_STD = 1 / 6

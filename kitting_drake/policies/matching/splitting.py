@@ -175,8 +175,8 @@ def _find(
     around: Outline,
     resolution: float,
 ) -> _Found | None:
-    """Returns the object at the best pose of a recess's outline within a region; None if the
-    outline fits nowhere."""
+    """Fits a recess's outline within a region, and returns the object at the best fit; None if
+    the outline fits nowhere."""
     template = trace_outline(recess.mask, resolution)
     best: _Found | None = None
     for start in _starts(recess.mask, region, template, resolution):

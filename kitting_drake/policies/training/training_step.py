@@ -116,7 +116,7 @@ class Trainer:
         self._schedules = self._scheduled()
 
     def _scheduled(self) -> list[LambdaLR]:
-        """Makes the learning rate schedules of the optimisers, at the current step."""
+        """Makes the optimisers' learning rate schedules, which start at the current step."""
         for optimiser in self.optimisers.values():
             for group in optimiser.param_groups:
                 group["initial_lr"] = self.learning_rate

@@ -80,7 +80,7 @@ def _border(mask: Mask) -> Array:
 def _cell_beside(mask: Mask, position: tuple[int, int], ahead: tuple[int, int], side: int) -> bool:
     """Whether the cell ahead of a corner, to the left (-1) or to the right (1), is in the mask."""
     down, across = ahead
-    # In rows and columns, the direction to the right of (down, across) is (across, -down).
+    # Turned to the right, the direction (down, across) becomes (across, -down).
     right = (side * across, -side * down)
     row = position[0] + (down + right[0] - 1) // 2
     col = position[1] + (across + right[1] - 1) // 2

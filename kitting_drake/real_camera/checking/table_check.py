@@ -30,9 +30,9 @@ _REFUSED_OFF = 0.010
 _REFUSED_TILT = math.radians(1.3)
 """The largest tilt of the table, in radians, at which the robot acts."""
 _WARNED_OFF = 0.005
-"""The largest error of the table's height, in metres, without a warning."""
+"""An error of the table's height above this, in metres, gives a warning."""
 _WARNED_TILT = math.radians(0.65)
-"""The largest tilt of the table, in radians, without a warning."""
+"""A tilt of the table above this, in radians, gives a warning."""
 _STEP = 4
 """Only the rows and columns of an image at multiples of this are used."""
 _FARTHEST = 0.35

@@ -185,7 +185,7 @@ def _lean(kit: Kit, tool: Tool, side: int, rng: np.random.Generator) -> RigidTra
     room = max(other_half - _LEAN_CORNER, 0.0)
     along = float(rng.uniform(-room, room))
     splay, over = float(rng.uniform(-_LEAN_SPLAY, _LEAN_SPLAY)), float(rng.uniform(*_LEAN_OVER))
-    over = min(over, tool.length / 3)  # At most a third extends over the edge.
+    over = min(over, tool.length / 3)  # At most a third of the tool extends over the edge.
     leads = bool(rng.integers(2))
     # Distance along the tool from the end on the table to the block's edge.
     reach = tool.length - over

@@ -20,7 +20,7 @@ _ARMS = (((0.08, 0.03, 0.04), (0.025, 0.0)), ((0.03, 0.05, 0.04), (0.0, 0.04)))
 _HEIGHT = 0.04
 _WALL_HEIGHT = 0.02
 _ALONG_ARM = (0.035, 0.055)
-"""Range of the distance of the demonstrator's grasps from the corner along an arm, in metres."""
+"""Range of the distance from the block's corner to the demonstrator's grasp, in metres."""
 
 
 def _grasp(along_x: bool, distance: float) -> Grasp:
@@ -40,7 +40,7 @@ _FIXTURE = Footprint(
 
 @dataclass
 class BlockInsertion(PoseTask):
-    """An L-shaped block is put into a fixture. The demonstrator grips it by either arm."""
+    """An L-shaped block is put into a fixture. The demonstrator grips either of its arms."""
 
     def make_scene(self, *, grid: PixelGrid, seed: int, base: Path) -> Scene:
         X_WFixture, X_WBlock = draw_poses(

@@ -14,8 +14,8 @@ from systems.signals import Observation, PixelGrid
 SIDE = 113
 ORIENTATIONS = 36
 ROOM = 8
-"""The largest shift of a scene, in pixels. Then only the tip of a corner of the kit may leave the
-image."""
+"""The largest shift of a scene, in pixels. It moves at most the tip of a corner of the kit out of
+the image."""
 
 _BLOCK = 4.0
 """The side of a block, in pixels."""

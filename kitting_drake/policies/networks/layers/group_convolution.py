@@ -81,7 +81,7 @@ def rotated_patterns(fibre: Regular, size: int) -> Tensor:
         for m = 0 to M - 1, where M = N / q.
     """
     reach = size // 2
-    # This is an upper bound: escnn itself keeps about as many frequencies as the radius has pixels.
+    # Ask for more frequencies than escnn keeps: it keeps about one for each pixel of the radius.
     frequencies = tuple(range(0, 3 * reach + 1, fibre.quotient))
     pairs = kernel_basis(Scalar(), Irreps(frequencies), size)[:, :, 0]
     angles = 2 * math.pi * torch.arange(fibre.size, dtype=torch.float64) / fibre.order

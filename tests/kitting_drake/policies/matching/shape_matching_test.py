@@ -175,7 +175,8 @@ def test_nothing_is_left_after_grasps_failed_everywhere(seen):
 def test_a_nearly_right_or_reversed_place_is_corrected(seen, turn: float):
     observation, scene = seen
     grid, segmentation = observation.grid, segment(observation)
-    # With noise, part of the second object's recess is lost. So do not test it with a half turn.
+    # With noise, part of the second object's recess is lost. So for the half turn, test only the
+    # first object.
     for lies, belongs in true_places(scene)[: 1 if turn and not observation.valid.all() else 2]:
         pick, place = grid.to_pixel(lies[:2]), grid.to_pixel(belongs[:2])
         rotation = belongs[2] - lies[2]

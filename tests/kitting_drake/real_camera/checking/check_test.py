@@ -195,7 +195,7 @@ def test_a_rotation_about_the_block_is_reported_as_an_offset():
     frames = {"front": frames_of_block()["front"]}
     check = check_cameras(frames, with_poses(ONE, {"front": X}), BLOCK)
     assert np.hypot(*offset(check.cameras["front"].block, BLOCK)[:2]) < 5e-4
-    # The block is seen in place, but points 10 cm from it are off by 2.6 mm.
+    # The error is zero at the block's middle, but 2.6 mm at a distance of 10 cm from it.
     assert _line(check, "offset").verdict == BAD
 
 

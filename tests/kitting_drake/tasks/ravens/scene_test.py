@@ -211,7 +211,8 @@ def test_boxes_appear_one_at_a_time(sleeps: bool):
 
 
 def test_surface_points_span_the_object():
-    """Positions are compared at the middle of the points, so these must reach the object's ends."""
+    """An object's position is that of the middle of its points' bounding box. So the points must
+    reach the object's ends."""
     block = make_scene(BlockInsertion(), 0).objects[0]
     np.testing.assert_allclose(block.p_BPoints.min(axis=0), [-0.015, -0.015, 0], atol=1e-12)
     np.testing.assert_allclose(block.p_BPoints.max(axis=0), [0.065, 0.065, 0.04], atol=1e-12)
