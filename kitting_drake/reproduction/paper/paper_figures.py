@@ -157,8 +157,8 @@ def draw_table_1(results: Mapping[str, Result]) -> bytes:
 
 
 def _draw_task(axis: Axes, task: str, column: int, results: Mapping[str, Result]) -> None:
-    """Draws the panel of a task: our results, and the paper's results for our cells without
-    extensions."""
+    """Draws the panel of a task. It shows a result of the paper only where we have a result
+    without extensions."""
     for index, ((method, n), (colour, marker)) in enumerate(_ROWS.items()):
         for place, count in enumerate(sorted(RAVENS_DEMONSTRATIONS)):
             where = place + _ROW_STEP * (index - (len(_ROWS) - 1) / 2)
