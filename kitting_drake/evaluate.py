@@ -233,7 +233,7 @@ def _work(chosen: ChosenScenario, seed: int, log: Path | None) -> Episode | str:
 
 @functools.cache
 def _commit_of_process() -> str | None:
-    """Returns the commit of the code that runs. It is read at this process's first episode."""
+    """Returns the commit of the running code. It is read once, at this process's first episode."""
     return commit()
 
 

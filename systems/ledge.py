@@ -15,7 +15,7 @@ _OUTSIDE = (0.15, 0.6)
 """Range of the distance of the object's centre of mass beyond the block's edge when the object is
 released. The unit is the width of the side that rests on the block."""
 _MOST_OUTSIDE = 0.008
-"""Largest distance of the centre of mass beyond the edge, in metres."""
+"""Upper limit of this distance, in metres."""
 _BESIDE = 0.005
 """Along the edge, the object must rest on the block on both sides of its centre of mass. Points
 closer to the centre of mass than this, in metres, do not count."""
@@ -116,10 +116,10 @@ def moved_gripper(
     """The gripper's pose after it has carried an object to a goal.
 
     Args:
-        gripper: the gripper's pose before.
-        p_WHeld: position of a point of the object before, in the world.
-        yaw: the object's heading before, in radians.
-        goal: position of the same point, and heading of the object, afterwards.
+        gripper: the gripper's pose before the motion.
+        p_WHeld: a point of the object before the motion, in the world.
+        yaw: the object's heading before the motion, in radians.
+        goal: the same point and the object's heading after the motion.
     """
     turn = goal.theta - yaw
     dx, dy = gripper.x - p_WHeld[0], gripper.y - p_WHeld[1]

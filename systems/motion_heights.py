@@ -29,8 +29,8 @@ def motion_heights(heights: SurfaceHeights, parameters: PickPlaceParameters) -> 
     """Computes the heights of a motion.
 
     The fingertips go below the object's top by a share of its height, within limits, and stay above
-    the table. While the object is carried, its bottom is as far below the fingertips as the surface
-    on which it stood was at the pick.
+    the table. At the pick, they are some distance above the surface on which the object stands. The
+    carried object extends below them by this distance.
 
     Args:
         heights: the heights of the surfaces, as `read_surface_heights` returns them.

@@ -32,8 +32,8 @@ _SHARE = 0.98
 """Share of the limits that a motion uses at the path's points. Between them it uses a little
 more."""
 _RATE_SHARE = 0.9
-"""The same for the limits of torque rates. It is smaller, because the model of the inertia is not
-exact."""
+"""Share of the limits of torque rates that a motion uses. It is less than `_SHARE`, because the
+model of the inertia is not exact."""
 _LEAST, _UNLIMITED = 1e-9, 1e12
 
 

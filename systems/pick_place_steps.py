@@ -33,8 +33,8 @@ _STUCK = 0.004
 """If the opening of the jaws stays below its goal by more than this, in m, they stick to the
 object."""
 _PUSH = 1 / 3
-"""Jaws that stick are pushed open with this share of the grasp force. It is added to the force by
-which they follow their command."""
+"""The force that pushes sticking jaws open, as a share of the grasp force. It is added to the force
+with which the jaws follow their command."""
 _LONGEST_RELEASE = 1.0
 """After this time, in s, the hand rises even if the jaws stick."""
 _RISEN = 0.0005

@@ -89,8 +89,8 @@ def claim_folder(folder: Path, name: str, described: Any, *, of: str) -> None:
         folder: the folder.
         name: the name of the JSON file.
         described: the run's description, serializable as JSON.
-        of: what identifies a run, such as `scenario or version`, for the error message "the
-            folder holds the files of another ...".
+        of: what identifies a run, such as `scenario or version`. It completes the error message
+            "the folder holds the files of another ...".
 
     Raises:
         UserError: the folder contains other files, or those of a different run.

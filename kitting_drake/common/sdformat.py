@@ -46,8 +46,8 @@ def model_text(path: Path, *, friction: float = 1.0, mass: float = 1.0) -> str |
         return None
     for uri in root.iter("uri"):
         if uri.text and "://" not in uri.text:
-            # A text has no folder, so make URIs absolute. Do not escape them, because Drake does
-            # not decode escapes.
+            # Make URIs absolute, because Drake cannot resolve relative ones in a text. Do not
+            # escape them, because Drake does not decode escapes.
             uri.text = f"file://{path.resolve().parent / uri.text}"
     return ElementTree.tostring(root, encoding="unicode")
 

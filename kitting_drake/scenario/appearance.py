@@ -55,8 +55,8 @@ class Appearance:
     # a surface, the last one wins.
     paints: dict[str, Paint] = dc.field(default_factory=dict)
 
-    # Shiny surfaces, by pattern as for paints: the fraction, 0 to 1, of their pixels for which the
-    # cameras measure no depth.
+    # Sheen by pattern (see `paints`). Sheen is the fraction, 0 to 1, of a surface's pixels for
+    # which the cameras measure no depth.
     sheen: dict[str, float] = dc.field(default_factory=dict)
 
     # The lights. If there are none, a light is at each camera.

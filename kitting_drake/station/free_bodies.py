@@ -96,8 +96,8 @@ class FreeBodies:
         filters = self._scene_graph.collision_filter_manager(
             self._scene_graph.GetMyMutableContextFromRoot(root_context)
         )
-        # Thaw before freezing: thawing an object allows all of its contacts, including those that
-        # freezing another object excludes.
+        # Thaw objects first: thawing allows all contacts of an object, so it would undo filters
+        # that freezing other objects has just set.
         for body, resting in sorted(changed, key=lambda change: change[1]):
             own = self._geometry([body])
             if resting:

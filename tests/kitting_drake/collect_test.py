@@ -69,7 +69,7 @@ def collect(folder: Path, count: int, oracle: Oracle | None = None, workers: int
 
 
 def content(folder: Path) -> dict[str, object]:
-    """The whole content of a demonstrations file by name."""
+    """All attributes and data sets of a demonstrations file, by name."""
     found: dict[str, object] = {}
 
     def note(name: str, item: h5py.Group | h5py.Dataset) -> None:

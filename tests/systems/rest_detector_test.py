@@ -76,8 +76,8 @@ def test_rest_takes_time_to_sleep():
     ("metres", "radians"), [(0.8 * POSITION, 0.8 * ANGLE), (0.0, 0.8 * ANGLE), (0.0, 0.0)]
 )
 def test_an_object_that_trembles_in_place_rests(metres: float, radians: float):
-    """Only the distance matters, not the speed. A drifting object would exceed the tolerance
-    within `time_to_sleep` at a tenth of this speed."""
+    """Only the distance matters, not the speed. At a tenth of the trembling object's speed, a
+    drifting object would exceed the tolerance within `time_to_sleep`."""
     table = Table()
     for sign in (1, -1) * 8:
         table.move_by(LEFT, sign * metres, sign * radians)

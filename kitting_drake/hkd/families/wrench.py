@@ -150,7 +150,7 @@ def _rectangle(x_low: float, x_high: float) -> CrossSection:
 
 
 def _swung_ends(p: WrenchParameters, bend: float) -> list[CrossSection]:
-    """Returns regions for the ends of an S-shaped shank, each between a bend and a head."""
+    """Returns the two regions of an S-shaped shank that lie between a bend and the nearest head."""
     half = p.center_distance_mm / 2
     cells = []
     for head, side in ((p.front, 1), (p.back, -1)):

@@ -49,7 +49,7 @@ def load_named(name: str, base: Path | None = None) -> Tool:
 
 
 def is_part_kind(name: str) -> bool:
-    """Whether a name is only a kind of part, without dimensions, and no tool has this name."""
+    """Whether a name is that of a kind of part, without dimensions, and not that of a tool."""
     return name in PART_KINDS and name not in tool_names() and name not in user_tool_names()
 
 

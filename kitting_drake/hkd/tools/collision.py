@@ -236,7 +236,7 @@ def runs(
 
 
 def _pruned(hulls: list[np.ndarray], tolerance: float) -> list[np.ndarray]:
-    """Drops hulls, smallest first, as long as no projection shrinks by more than `tolerance`."""
+    """Drops hulls, smallest first. The projections of their union shrink by at most `tolerance`."""
     wholes = [projection(hulls, plane) for plane in (_XY, _XZ, _YZ)]
     kept = list(hulls)
     for hull in sorted(hulls, key=lambda h: Manifold.hull_points(h).volume()):

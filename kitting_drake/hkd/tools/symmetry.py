@@ -77,7 +77,7 @@ def symmetry_order(triangles: NDArray[np.float64]) -> int:
     outline = footprint(triangles).scale((1e3, 1e3))
     size = _size(outline)
     for order in ORDERS:
-        # At any translation, the deviation is at least half the difference in size.
+        # However the copy is shifted, the outlines deviate by at least half the difference in size.
         differs = np.abs(_size(outline.rotate(360.0 / order)) - size).max()
         alike = differs < 2 * MOST_OUTLINE_DEVIATION_MM
         if alike and measure_rotation(triangles, order).is_symmetric:

@@ -21,11 +21,11 @@ _ROUGH = 0.022
 _MOST_FINE = 0.1
 _HOLE_BALL_MM = 0.6
 _STRIP_MM = 1.2
-"""Half the largest width, in mm, of an eroded region that `_shaded_holes` counts as a strip."""
+"""In `_shaded_holes`, eroded regions that are at most twice this wide, in mm, are strips."""
 _EDGE_MM = 2.3
 """Over the rough pixels at a tool's edge, the ground is extended by at most this far, in mm."""
 _SHINE_STEEP = 0.6
-"""The largest slope of the edge of a specular reflection, in logarithms of light per mm."""
+"""The edge of a specular reflection is less steep than this, in logarithms of light per mm."""
 _STEP_REACH_MM = 1.5
 """The radius around a pixel, in mm, of the area in which a brightness step is measured."""
 _SHINY, _SHINY_SHARE = 0.06, 0.25
@@ -40,7 +40,7 @@ _GLARE_REACH_MM, _GLARE_GAP_MM, _GLARE_MM2, _GLARE_SHARE = 8.0, 2.5, 0.7, 0.25
 if it is narrower than twice `_GLARE_GAP_MM`. An added region has an area of at least `_GLARE_MM2`,
 of which at least the share `_GLARE_SHARE` is brighter than the ground."""
 _BAY_MM = 12.0
-"""Half the largest width of a bay or hole that may be a reflection, in mm."""
+"""Only bays and holes at most twice this wide, in mm, may be reflections."""
 _BLENDED_MM, _SHADED = 1.2, 0.06
 """A tool blends into a shadow where the brightness step is wider than `_BLENDED_MM` and the shadow
 is darker than `_SHADED`, in logarithms of light."""

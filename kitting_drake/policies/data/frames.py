@@ -22,8 +22,8 @@ STATE = "observation.state"
 ACTION = "action"
 GRIPPER = "gripper"
 """The name of the last entry of states and actions. In a state it is the opening between the pads,
-in m. In an action it is the opening towards which the fingers' springs pull, in m. An opening
-smaller than the held object grips it, and a negative one grips more firmly."""
+in m. In an action it is the opening towards which the fingers' springs pull, in m. This opening is
+smaller than a held object, or negative for a firmer grip."""
 RATES = range(10, 31)
 """The permitted numbers of frames per second."""
 DEFAULT_RATE = 16

@@ -19,7 +19,7 @@ from kitting_drake.policies.matching.registration import (
 )
 
 _WORST_COST = 0.0019
-"""The largest mismatch, in metres, of an object and a recess into which it fits."""
+"""An object fits into a recess only if their mismatch is less than this, in metres."""
 _GOOD = 0.0005
 """An object whose mismatch with its recess is less than this, in metres, does not count as
 reversed."""
@@ -27,8 +27,8 @@ _CLEARLY_BETTER = 0.75
 """An object counts as reversed only if its mirror image's mismatch with the recess is less than
 this share of the object's own mismatch."""
 _PROMISING = 2.0
-"""An object's outline is registered only to recesses whose `coarse_cost` for the object is at most
-this many times the lowest one of all recesses."""
+"""An object's outline is registered only to recesses whose `coarse_cost` is at most this many times
+the object's lowest `coarse_cost`."""
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ Evidence = dict[str, float]
 _RING = 3
 """How far the surroundings of an object extend from it, in pixels."""
 _HOLE = 0.003
-"""The least depth of a hole below its rim, in metres."""
+"""Pixels that are lower than the rim by more than this, in metres, count as a hole."""
 _REGION_FACTS = (
     *("is_object", "object_seen", "depth", "hole", "size", "apart"),
     *("over_recess", "cost", "reverse", "spread", "rival", "offset", "too_high", "recess_seen"),

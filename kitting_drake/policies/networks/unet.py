@@ -28,9 +28,9 @@ class UNetSize:
     """The width of a U-net."""
 
     down: tuple[int, int, int, int, int] = (16, 32, 64, 128, 128)
-    """The numbers of fields of the encoder's five blocks, with pooling between them."""
+    """The number of fields in each of the encoder's five blocks. Pooling separates the blocks."""
     up: tuple[int, int, int, int] = (64, 32, 16, 16)
-    """The numbers of fields of the decoder's four blocks."""
+    """The number of fields in each of the decoder's four blocks."""
     head: int = 16
     """The number of scalar channels before the last layer."""
     skip: int = 3

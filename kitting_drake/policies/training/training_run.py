@@ -101,8 +101,8 @@ class Settings:
 
 
 def _initial_networks(settings: Settings, learned: TrainingData, start: Path | None) -> Networks:
-    """Makes the networks before the first step, with the weights of the file `start` or, if it is
-    None, with untrained weights."""
+    """Makes the networks with which the training begins. They have the weights of the file `start`;
+    if `start` is None, they are untrained."""
     torch.manual_seed(settings.seed)
     try:
         if start is not None:

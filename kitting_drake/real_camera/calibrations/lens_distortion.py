@@ -50,9 +50,9 @@ def known_model(name: object, where: str) -> str:
 
 
 def checked_coefficients(model: str, values: tuple[float, ...], where: str) -> tuple[float, ...]:
-    """Returns the coefficients, without those of a thin prism or a tilted sensor if these are zero.
+    """Returns the coefficients. Drops those of a thin prism or a tilted sensor if they are zero.
 
-    If all coefficients are zero, none are returned, except for the equidistant model.
+    If all coefficients are zero, all are dropped. The equidistant model keeps its zeros.
 
     Args:
         model: one of this module's models.

@@ -34,20 +34,20 @@ _WARNED_OFF = 0.005
 _WARNED_TILT = math.radians(0.65)
 """A tilt of the table above this, in radians, gives a warning."""
 _STEP = 4
-"""Only the rows and columns of an image at multiples of this are used."""
+"""Only every `_STEP`th row and column of an image is used."""
 _FARTHEST = 0.35
 """Planes are searched for within this distance of the table's height, in metres."""
 _LEAST = 150
-"""The least number of used pixels on a plane."""
+"""Planes with fewer used pixels than this are ignored."""
 _BELOW = 0.5
-"""The plane at the calibrated height counts as the table if it has enough pixels: at least this
-fraction of those of every plane below it. Otherwise the plane with the most pixels counts."""
+"""The plane at the calibrated height counts as the table if it has at least this fraction of the
+pixels of each plane below it. Otherwise the plane with the most pixels counts."""
 _ABOVE = 0.08
-"""The plane at the calibrated height must also have at least this fraction of the pixels of any
+"""The plane at the calibrated height must also have at least this fraction of the pixels of each
 plane above it. The fraction is small, because objects may hide most of a table."""
 _CURVED = 0.5
-"""The depths are probably distances from the camera if their conversion to depths multiplies the
-table's noise by less than this."""
+"""The depths are taken for distances from the camera if `_as_depth` reduces the table's noise to
+less than this fraction."""
 _FLAT = 0.0005
 """The noise below which a table counts as flat, in metres."""
 
@@ -173,8 +173,8 @@ def _points(
 def _is_range(
     camera: BenchCamera, depth: NDArray[np.float32], calibration: Calibration, fit: TableFit
 ) -> bool:
-    """Whether the depths are probably distances from the camera: converting them to depths along
-    the optical axis makes the table much flatter."""
+    """Whether the depths are probably distances from the camera. If they are, their conversion by
+    `_as_depth` makes the table much flatter."""
     if fit.plane.noise < _FLAT:
         return False
     points = _points(camera, camera.X_BC, _as_depth(camera, depth), calibration)

@@ -31,7 +31,7 @@ _FIELDS = (
 )
 _CORNERS = ("bottom_left", "bottom_right", "top_left")
 _NEEDED = 12
-"""The least number of corners for a pose, or all corners of a board that has fewer."""
+"""A pose needs at least this many corners. A board with fewer corners must show all of them."""
 _SHIFT = 0.42
 """The approximate shift of corners by OpenCV's refinement of AprilTags, in pixels."""
 _LEVEL = math.radians(3)

@@ -274,13 +274,13 @@ class ReliabilitySummary:
 
     decisions: int
     right: float
-    """The share of right decisions among all."""
+    """The share of all decisions that are right."""
     calibration_error: float
     """The expected calibration error over ten bins."""
     wrong_answers: float
     """Of the decisions above the threshold, the share that is wrong."""
     refused: float
-    """Of the right decisions, the share that is below the threshold."""
+    """The share of the right decisions that are below the threshold."""
     bins: list[tuple[float, float, int]]
     """For each bin: the mean confidence, the share of right decisions and the number of
     decisions."""

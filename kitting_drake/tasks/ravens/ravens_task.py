@@ -27,7 +27,7 @@ _UPRIGHT = math.cos(math.radians(20.0))
 
 def grasp_rng(seed: int) -> np.random.Generator:
     """The random generator of the demonstrator's grasps. As in the gripper version of Ravens,
-    grasps are not at an object's middle, so that the pick reveals along which axis the jaws
+    grasps are away from an object's middle. Their positions thus show along which axis the jaws
     close."""
     return np.random.default_rng([seed, _GRASP_STREAM])
 

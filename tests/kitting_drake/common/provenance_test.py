@@ -23,7 +23,7 @@ def git(folder: Path, *arguments: str) -> str:
 
 @pytest.fixture
 def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A checkout with one file and one commit, whose package is imported."""
+    """A checkout with one file and one commit, from which the package seems to be imported."""
     package = tmp_path / "kitting_drake" / "__init__.py"
     package.parent.mkdir()
     package.write_text("")

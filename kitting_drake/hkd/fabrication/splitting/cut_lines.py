@@ -180,7 +180,7 @@ class _Cutter:
             within = ndimage.distance_transform_edt(inside) * _CELL
             near = LEAST_WALL + _CELL
             price += _FOOT * inside + _FOOT_SIDE * ((from_foot < near) & (within < near))
-            # Prefer the middle between two feet, because feet are wider at their tops.
+            # Prefer the middle between two feet: higher up, the gap between them is narrower.
             price += _OFF_THE_MIDDLE * (from_foot.max() - from_foot) * ~inside
         return price
 

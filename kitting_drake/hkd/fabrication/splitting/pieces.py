@@ -85,7 +85,7 @@ def split_block(
     notes = []
     cuts = choose_cuts((length, width), openings, bed, feet)
     if cuts is None and feet:
-        # Allow thin walls on the upper slopes of the feet, but not below them.
+        # Try again, but allow thin walls on the upper slopes of the feet (not lower down).
         cuts = choose_cuts((length, width), openings, bed, feet[:_UPRIGHT])
         notes.append("cuts beside feet leave thin edges on the slopes of the feet: trim them")
     if cuts is None:

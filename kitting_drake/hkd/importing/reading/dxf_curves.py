@@ -142,7 +142,7 @@ def _scale(
 def _likely(path: Path, document: Any, extent: float) -> tuple[float, str]:
     """Chooses the unit of a drawing that states none.
 
-    This is the only unit that makes the drawing as long as a tool. If no unit does, it is mm.
+    The chosen unit is the only one that makes the drawing as long as a tool, or mm if none does.
 
     Returns:
         The length of the unit in mm, and a phrase for the user.

@@ -28,7 +28,7 @@ def _stand_in() -> types.ModuleType:
     return module
 
 
-# If escnn was imported before, the real lie_learn stays.
+# `setdefault` keeps the real lie_learn if escnn was imported first.
 sys.modules.setdefault(_MODULE, _stand_in())
 with warnings.catch_warnings():
     # escnn warns about an optional package that planar groups do not need.

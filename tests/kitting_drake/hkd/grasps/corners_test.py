@@ -46,7 +46,7 @@ def test_a_corner_is_held_against_what_is_opposite(
 ):
     best = propose_grasps(triangles(solid), np.zeros(3))[0]
     assert best.penalties["corner"] > 0
-    # A corner is at +x, and so is an axis of symmetry. The jaws close along or across such an axis.
+    # The x axis is an axis of symmetry. The jaws close along or across an axis of symmetry.
     line = math.degrees(best.theta) + 90
     assert math.remainder(line, 180 / sides) == pytest.approx(0.0, abs=0.6)
     if width is not None:

@@ -154,7 +154,7 @@ def test_unit_pose_and_format_do_not_matter(
         mesh.apply_translation([900, -400, 100])
     mesh.apply_scale(units_per_mm)
     path = exported(mesh, tmp_path / f"mallet.{suffix}")
-    # For an unknown unit, give the length; for an ambiguous unit, give the unit.
+    # 37 units per mm is no known unit, so give the length. Inches are ambiguous, so give the unit.
     length = 175.0 if units_per_mm == 37.0 else None
     unit = "inches" if units_per_mm == 1 / 25.4 else None
     report = bring(path, tmp_path / "tools", length_mm=length, unit=unit)

@@ -8,7 +8,7 @@ CAMERA = np.array([-60.0, 20.0, 400.0])
 
 
 def silhouette(outline: CrossSection, heights: np.ndarray) -> CrossSection:
-    """What the camera sees of a prism: the union of its outline's projections from some heights."""
+    """A tool's silhouette: the union of the projections of its outline at the given heights."""
     seen = CrossSection()
     for height in heights:
         factor = CAMERA[2] / (CAMERA[2] - height)

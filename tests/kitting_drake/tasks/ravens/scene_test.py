@@ -135,7 +135,7 @@ def test_all_objects_are_in_the_workspace(kind: type[TaskConfig]):
 @each_task
 @pytest.mark.parametrize("seed", SEEDS)
 def test_objects_are_free_and_reachable(kind: type[TaskConfig], seed: int):
-    """Nothing touches at first. If the highest is always taken next, the open hand has room."""
+    """No objects touch at first. If they are taken highest first, the open hand has room."""
     posed = Posed(kind, seed)
     assert posed.contacts() == set()
     opening = PickPlaceParameters().open_width
