@@ -34,7 +34,7 @@ _SAME_HEIGHT = 0.003
 """A height counts as reached when the hand is at most this far below it, in m."""
 
 _HELD_REACH = 0.125
-"""How far a held object reaches from the fingertips at most, in m. `read_surface_heights` assumes
+"""A held object reaches at most this far from the fingertips, in m. `read_surface_heights` assumes
 the same."""
 _JAW_ROOM = 0.005
 """Distance of each pad from an object of known width before the jaws close, in m."""

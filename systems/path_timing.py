@@ -3,8 +3,8 @@ r"""Computes motions along a path in joint space that are as fast as the joints'
 `fastest_times` solves the time-optimal path parameterization by the reachability analysis of Pham
 and Pham, "A new approach to time-optimal path parameterization based on reachability analysis",
 IEEE T-RO 34 (2018): with x = (ds/dt)^2 and u = d2s/dt2 each limit of acceleration is linear in x
-and u. One pass backwards finds the largest x from which the end can be reached, one pass forwards
-takes the largest u.
+and u. A backward pass finds the largest x from which the end can be reached. Then a forward pass
+takes the largest u at each point.
 
 `SmoothMotion` averages such a motion over the last few milliseconds. This limits the jerk. All
 other limits still hold: the states that they allow form a convex set, and the average of states in

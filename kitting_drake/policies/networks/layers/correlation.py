@@ -27,7 +27,7 @@ KERNEL = 65
 COARSE_ROTATIONS = 48
 """The number of rotations of the coarse volume."""
 _REACH = 4
-"""How far around the pixel of a coarse cell the full correlation is evaluated, in pixels."""
+"""The full correlation is evaluated up to this far, in pixels, from the pixel of a coarse cell."""
 
 
 def lift(encoding: Tensor, angles: Tensor, size: int) -> Tensor:

@@ -149,7 +149,7 @@ def test_a_square_block_is_never_off_by_a_quarter_turn(yaw: float):
 
 @pytest.mark.parametrize("pose", [slow((0.45, -0.2, 1.1)), slow((0.6, 0.2, 0.3))])
 def test_distortion_does_not_displace_the_block(pose: tuple[float, float, float]):
-    """With distortion, pixels near the image's border cover more of the table than central ones."""
+    """Pixels near the border of a distorted image see more of the table, so they weigh more."""
     block = Block((0.20, 0.15, 0.05), pose)
     cameras = (
         dataclasses.replace(

@@ -21,7 +21,7 @@ from kitting_drake.reproduction.benchmarks.fits_figure import draw_fits
 
 
 def episode(seed: int, kitted: int) -> dict:
-    """The result of an episode with two tools: `kitted` succeed, the others are blocked."""
+    """An episode with two tools. The first `kitted` succeed, the others are blocked."""
     objects = [
         {
             "name": f"tool_{number}",
