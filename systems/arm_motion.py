@@ -286,7 +286,7 @@ class ArmMotion(JawMotion):
         # After a stop by the force guard the jaws may drag an object along, so rise to the higher
         # travel height.
         way.clear = state.travel_z if state.stops else state.clear_z
-        # Do not turn joint 7 back: it would take longer than the other joints.
+        # Do not turn joint 7 to the home yaw, because the other joints would have to wait for it.
         way.over[6] = now[6]
 
     def waiting_joints(

@@ -20,7 +20,7 @@ hand, as in `systems.arm_postures`."""
 _STEP = 0.005
 """Postures are computed for distances of the hand from the base's axis in steps of this, in m."""
 _FARTHEST = 1.0
-"""The largest distance of the hand from the base's axis, in m."""
+"""Postures are computed up to this distance of the hand from the base's axis, in m."""
 _CHUNK = 256
 
 

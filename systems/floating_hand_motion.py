@@ -137,7 +137,7 @@ class HandMotion(JawMotion):
         across, height = float(np.linalg.norm(ways[:2])), float(ways[2])
         of_plane, of_height, _ = limits.of_parts()
         if mode == Mode.CARRY:
-            # Travel across only when the lift is almost complete, after half of the braking time.
+            # Travel across only when the lift is almost complete: half of its braking time is over.
             delays = np.maximum(delays, braking / 2)
         if mode in (Mode.APPROACH, Mode.CARRY):
             # Delay the descent until the hand is near its goal.

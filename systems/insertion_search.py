@@ -26,9 +26,9 @@ class InsertionSearch:
     """Parameters of the search. The hand presses lightly, rotates to and fro, and then follows a
     spiral, until the object slips into the cavity."""
 
-    # Amplitude of the yaw oscillation, in rad. The oscillation undoes a small rotation of the tool
-    # by the closing jaws. Zero disables it; if `reach` is zero as well, the object is released
-    # without a search.
+    # Amplitude of the yaw oscillation, in rad. The closing jaws may have rotated the tool a little;
+    # the oscillation undoes this. Zero disables it; if `reach` is zero as well, the object is
+    # released without a search.
     amplitude: float = bounded(0.12, 0.0, 0.5)
 
     # Radius of the spiral, in m, about as large as the calibration error. Zero disables the spiral.

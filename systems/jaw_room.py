@@ -16,7 +16,7 @@ higher."""
 _ROOM = 0.005
 """The gap between the object and each finger, in m. Nothing may stand in it."""
 _LINES = 7
-"""Number of lines across the pads along which the width is measured."""
+"""The width is measured along this many lines across the pads."""
 
 
 def object_width(

@@ -248,7 +248,7 @@ def noisy_depth(
         parameters: the parameters of the noise.
         camera: the camera's intrinsics.
         random: the random generator of all draws.
-        sheen: (height, width) for each pixel, the share of its surface that becomes holes; None if
+        sheen: (height, width), for each pixel the share of its surface that becomes holes; None if
             no surface is shiny.
     """
     seen = np.isfinite(depth) & (depth > 0)

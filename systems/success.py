@@ -17,7 +17,7 @@ class AddS:
     """Success by the paper's measure (section IV-C): ADD-S below a threshold."""
 
     threshold: float = 0.0035
-    """Largest ADD-S of a success, in metres."""
+    """ADD-S must be below this, in metres."""
 
     @property
     def description(self) -> str:
@@ -32,11 +32,11 @@ class PoseWithin:
     """Success as in Ravens: pose errors below thresholds."""
 
     position: float = 0.01
-    """Largest horizontal distance from the goal, in metres."""
+    """The horizontal distance from the goal must be below this, in metres."""
     angle: float = math.radians(15.0)
-    """Largest heading error, modulo the object's symmetry, in radians."""
+    """The heading error, modulo the object's symmetry, must be below this, in radians."""
     height: float | None = None
-    """Largest height error, in metres; None if heights are not compared."""
+    """The height error must be below this, in metres; None if heights are not compared."""
 
     @property
     def description(self) -> str:

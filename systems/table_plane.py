@@ -14,13 +14,13 @@ _LEAST_SHARE = 0.15
 _BIN = 0.001
 """Width of the bins of the histogram of heights, in metres."""
 _FAR = 0.03
-"""The table is sought within this distance of the bottom of the grid, in metres."""
+"""The table is sought up to this distance above and below the bottom of the grid, in metres."""
 _BAND = 0.004
-"""Pixels nearer to a plane than this, in metres, belong to the plane. The limit is three times the
-noise if that is larger."""
+"""A pixel belongs to a plane if it is nearer to the plane than this, in metres, or than three times
+the noise."""
 _FITS = 8
 """Number of fits of the plane. In the first half of the fits, the area grows from the middle of the
-grid to all of it. In the second half, only pixels nearer to the plane are used."""
+grid to the whole grid, and the limit of `_BAND` is doubled."""
 _LEVEL = 0.0003
 """A table whose deviations are smaller than this, in metres, counts as level."""
 _MOST_OFF, _STEEPEST = 0.010, 0.035

@@ -136,7 +136,7 @@ class KitProof:
 
     @property
     def may_be_tight(self) -> bool:
-        """Whether failures that a wider cavity may prevent (`_TIGHT`) keep the kit from fitting."""
+        """Whether the kit does not fit, but would fit without the failures of `_TIGHT`."""
         stuck = sum(tool.causes[cause] for tool in self.tools.values() for cause in _TIGHT)
         return not self.fits and self.kitted + stuck >= GOOD * self.tried
 

@@ -45,7 +45,7 @@ _HOST = "127.0.0.1"
 _LONGEST = 100_000
 """The largest size of an action in JSON, in bytes."""
 _LEAST_RANGE = 0.02
-"""The least height that is drawn in white, in metres. It keeps the noise of an empty table dark."""
+"""White stands for at least this height, in metres, to keep the noise of an empty table dark."""
 _UNSEEN = np.array([60, 0, 90], np.uint8)
 """The colour (RGB) of pixels that no camera sees."""
 

@@ -73,7 +73,8 @@ def test_a_stage_that_was_complete_when_an_action_began_is_kept():
     assert advance(Mode.OBSERVE, first, away) == [0.0, 0.0]
     assert advance(Mode.APPROACH, first, away) == [1.0, 0.0]
     assert system.reward(context) == 0.75
-    # From then on the stage counts as filled, even if its object leaves, and later goals count.
+    # From then on the stage counts as filled, even if its object leaves. So a filled later goal is
+    # rewarded.
     assert advance(Mode.RETREAT, away, second) == [1.0, 0.0]
     assert system.GetOutputPort("reward").Eval(context).tolist() == [1.0]
     # The kept goals are stored in the context, not in the system.

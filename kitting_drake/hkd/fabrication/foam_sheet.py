@@ -22,7 +22,7 @@ MOST_KITS = 60
 """The largest number of kits on a sheet."""
 
 _MIXTURES = 40
-"""The number of packings to try in which random copies of the kit are turned by 90 degrees."""
+"""In this many of the tried packings, random copies of the kit are turned by 90 degrees."""
 _SHEET, _BLOCK = "SHEET", "BLOCK"
 _STROKES = ("#0b5fa5", "#2b8a3e", "#9c36b5", "#d9480f", "#087f5b", "#a61e4d", "#5f3dc4")
 _COLOURS = (4, 3, 6, 30, 2, 1, 150, 80)

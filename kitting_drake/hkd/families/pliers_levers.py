@@ -252,7 +252,7 @@ def slab_hulls(
         bevel: the bevel of the lower rim, in mm.
         flanks: (x start, x end, y) of the gripped flanks, which the hulls exceed by at most 0.05
             mm.
-        tolerance: the largest distance of a hull outside the profile, in mm.
+        tolerance: how far the hulls may extend beyond the profile, in mm.
     """
 
     def grown(p: CrossSection, d: float) -> CrossSection:

@@ -45,7 +45,7 @@ _COMPOSED, _PARTS = 0.2, 0.3
 _JITTER = 0.22
 """The logarithm of the largest factor by which a length or an angle of a design changes."""
 _REFINED = 6.0
-"""The longest edge of the triangles before the warp, in mm."""
+"""Before the warp, triangles are divided until no edge is longer than this, in mm."""
 _SIMPLIFIED = 0.08
 """The tolerance of the simplification after the warp, in mm."""
 _POOR_GRASP = 3.0

@@ -37,7 +37,7 @@ _BLURRED_MM = 1.6
 _HEIGHTS_MM = (0.5, 100.0)
 _CAMERAS_MM = (100.0, 3000.0)
 _SHARE_OF_HEIGHT = 0.5
-"""The largest accepted height of a tool, as a share of the camera's height."""
+"""A tool may be at most this high, as a share of the camera's height."""
 _DOUBTED_MM = 0.12
 """An outline is in doubt if the area of its unclear regions, divided by its perimeter, exceeds
 this, in mm."""

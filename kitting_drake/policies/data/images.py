@@ -60,8 +60,8 @@ class LabelledImage:
     motion: Motion | None = None
     """The motion that augmented the image; None without augmentation."""
     curvatures: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2)))
-    """(1 + n, 2): a curvature for the object of each pick (see `curved_crop`); empty without
-    curvature augmentation."""
+    """(1 + n, 2): the curvature (a, b) in `curved_crop`, first for `pick`, then for each of
+    `other_picks`; empty without curvature augmentation."""
 
     @classmethod
     def from_action(cls, image: Image, action: PickPlaceAction, grid: PixelGrid) -> LabelledImage:

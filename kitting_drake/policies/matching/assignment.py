@@ -51,7 +51,7 @@ def match(segmentation: Segmentation, resolution: float) -> list[Pair]:
 
     Args:
         segmentation: the segmentation of an observation.
-        resolution: the side of its pixels, in metres.
+        resolution: the side of a pixel, in metres.
     """
     objects, regions = segmentation.objects, segmentation.unfilled_recesses
     if not objects or not regions:
@@ -86,7 +86,7 @@ def reversed_objects(
         segmentation: the segmentation of an observation.
         pairs: the result of `match`. A paired object's mirror image must fit clearly better than
             the object as seen.
-        resolution: the side of its pixels, in metres.
+        resolution: the side of a pixel, in metres.
 
     Returns:
         Indices of these objects in `Segmentation.objects`.

@@ -106,7 +106,7 @@ def trace_outline(mask: Mask, resolution: float, *, close: bool = False) -> Outl
 
     Args:
         mask: (rows, cols) with at least one True pixel.
-        resolution: the side of its pixels, in metres.
+        resolution: the side of a pixel, in metres.
         close: whether to close narrow notches, which the object's recess does not have.
     """
     margin = math.ceil((_FARTHEST + _CLOSING_RADIUS) / resolution) + 1

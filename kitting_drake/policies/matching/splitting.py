@@ -42,14 +42,15 @@ _RIM = 1.5
 """In the search for poses, the weight of the agreement between the outlines, relative to the mean
 score of the recess's pixels."""
 _INSIDE = 0.94
-"""The least share of a recess's area that must lie within the region."""
+"""At least this share of a recess's area must lie within the region."""
 _NEAR = 0.0025
 """A point of an object's outline coincides with the region's outline if the two are less than this
 apart, in metres."""
 _SHARED = 0.45
 """At least this fraction of an object's outline must coincide with the region's outline."""
 _COST = 0.0010
-"""The largest mean distance of the coinciding points from the region's outline, in metres."""
+"""The coinciding points must lie, on average, at most this far from the region's outline, in
+metres."""
 _UNEXPLAINED = 0.15
 """If the objects found in a region leave more than this share of its area uncovered, they must all
 agree clearly with the region's outline (`_CLEARLY`)."""

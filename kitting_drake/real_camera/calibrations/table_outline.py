@@ -113,8 +113,8 @@ def read_outline(node: dict[str, Any], path: Path, grid: PixelGrid) -> TableOutl
         grid: the pixels of the workspace.
 
     Raises:
-        UserError: a field is invalid, or its polygon misses the workspace. The message names the
-            file and the field.
+        UserError: a field is invalid, a polygon misses the workspace, or no pixel is left. The
+            message names the file and the fields.
     """
     region: Polygon = ()
     ignore: tuple[Polygon, ...] = ()

@@ -254,7 +254,8 @@ def _disagreements(maps: Mapping[str, NDArray[np.float32]]) -> dict[tuple[str, s
 def _aligned(
     poses: Mapping[str, Array], seen: Mapping[str, SeenBlock], block: Block
 ) -> dict[str, Array]:
-    """Shifts poses and rotates them about the vertical, so that they agree on the block's pose."""
+    """Shifts poses and rotates them about the vertical, so that all cameras see the block at the
+    same pose."""
     period = block.period
     if block.pose is None:
         first = next(iter(seen.values())).yaw

@@ -26,13 +26,13 @@ UNVERIFIED = (
 )
 """The warning for a calibration that was not verified."""
 _REFUSED_OFF = 0.010
-"""The largest error of the table's height, in metres, at which the robot acts."""
+"""The robot does not act if the error of the table's height exceeds this, in metres."""
 _REFUSED_TILT = math.radians(1.3)
-"""The largest tilt of the table, in radians, at which the robot acts."""
+"""The robot does not act if the table's tilt exceeds this, in radians."""
 _WARNED_OFF = 0.005
-"""An error of the table's height above this, in metres, gives a warning."""
+"""The user is warned if the error of the table's height exceeds this, in metres."""
 _WARNED_TILT = math.radians(0.65)
-"""A tilt of the table above this, in radians, gives a warning."""
+"""The user is warned if the table's tilt exceeds this, in radians."""
 _STEP = 4
 """Only every `_STEP`th row and column of an image is used."""
 _FARTHEST = 0.35
@@ -40,8 +40,8 @@ _FARTHEST = 0.35
 _LEAST = 150
 """Planes with fewer used pixels than this are ignored."""
 _BELOW = 0.5
-"""The plane at the calibrated height counts as the table if it has at least this fraction of the
-pixels of each plane below it. Otherwise the plane with the most pixels counts."""
+"""The plane at the calibrated height counts as the table if it has enough pixels: at least this
+fraction of the pixels of every plane below it. Otherwise the plane with the most pixels counts."""
 _ABOVE = 0.08
 """The plane at the calibrated height must also have at least this fraction of the pixels of each
 plane above it. The fraction is small, because objects may hide most of a table."""
@@ -67,12 +67,12 @@ class TableFit:
 
     @property
     def is_refused(self) -> bool:
-        """Whether the table is so far off that no pick can be trusted."""
+        """Whether the table's height or tilt is so wrong that no pick can be trusted."""
         return abs(self.off) > _REFUSED_OFF or self.tilt > _REFUSED_TILT
 
     @property
     def is_doubtful(self) -> bool:
-        """Whether the table is far enough off for a warning."""
+        """Whether the table's height or tilt calls for a warning."""
         return abs(self.off) > _WARNED_OFF or self.tilt > _WARNED_TILT
 
 

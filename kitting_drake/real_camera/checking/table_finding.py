@@ -75,8 +75,8 @@ _ENOUGH = 0.6
 """If a workspace beyond `_TOO_NEAR` holds more than this share of the table area that the fullest
 workspace holds, all nearer workspaces are excluded."""
 _NEARLY = 0.97
-"""A workspace counts as good if it holds at least this share of the table area that the fullest
-remaining workspace holds. The good workspace that is nearest to the base is chosen."""
+"""Workspaces count as equally good if they hold at least this share of the table area of the best
+one. The one nearest to the base is chosen."""
 
 
 @dataclass(frozen=True)

@@ -94,7 +94,7 @@ def _topics(recording: Recording, camera: BenchCamera, alone: bool) -> tuple[str
 
 
 def _uncompressed(topics: Sequence[str]) -> list[str]:
-    """Returns the topics that are not compressed copies of others."""
+    """Returns the topics, except those that are compressed copies of others."""
     return [topic for topic in topics if topic.rpartition("/")[0] not in topics]
 
 

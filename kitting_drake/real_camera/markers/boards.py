@@ -68,7 +68,7 @@ class Board:
 
     @property
     def table_height(self) -> float:
-        """The height of the table in the base frame, below the board's middle, in metres."""
+        """The height of the table under the board's middle, in the base frame, in metres."""
         middle = self.X_BM @ [self.size[0] / 2, self.size[1] / 2, 0, 1]
         return float(middle[2]) - self.thickness
 

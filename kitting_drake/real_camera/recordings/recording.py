@@ -25,8 +25,8 @@ class RecordedMessage:
     since: float
     """The time of recording, in seconds after the recording's first message."""
     stamp: float
-    """The time of measurement by the message's header, or else the time of recording; in
-    seconds."""
+    """The time of measurement that the message's header states, in seconds. If it states none, the
+    time of recording."""
     body: Any
 
 

@@ -32,8 +32,8 @@ _SPACING, _COARSE = 0.025, 0.10
 _AROUND = 0.8
 """Bases are tried up to this distance from the workspace, along x and along y, in m."""
 _STEP, _FINER = 0.10, 0.05
-"""The spacing of the bases in the first search, and in the second search, in m. The second search
-is around the best bases of the first."""
+"""The spacing of the bases that are tried, in m: in a first search, and in a second search around
+the best bases of the first search."""
 _TURNS = (0.0, -45.0, 45.0, 180.0)
 """The yaws of the base to try, relative to the yaw at which it faces the workspace, in degrees."""
 

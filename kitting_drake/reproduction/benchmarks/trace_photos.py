@@ -65,7 +65,8 @@ class PhotoSpec:
     softness: float = 0.15
     """The standard deviation of `light` among the lamps. Larger values make softer shadows."""
     falloff: float = 0.25
-    """How uneven the light is: roughly its relative change from the sheet's middle to its edge."""
+    """How uneven the light is: roughly the relative change of its strength from the middle of the
+    sheet to the edge."""
     blur: float = 1.0
     """The standard deviation of the blur, in pixels."""
     noise: float = 0.006

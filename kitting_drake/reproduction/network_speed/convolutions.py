@@ -1,4 +1,4 @@
-"""Times the convolutions of a function alone, as a lower bound of the function's time."""
+"""Times only the convolutions of a function, which gives a lower bound of the function's time."""
 
 from __future__ import annotations
 

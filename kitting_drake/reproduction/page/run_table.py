@@ -1,4 +1,4 @@
-"""Reads and writes the files behind the pages of results, which hold the summaries of all runs.
+"""Reads and writes two files with the summaries of all runs. The pages of results use these files.
 
 `runs.csv` has one row per run, with the short fields of the `summary.json` of `evaluate`. A nested
 field has a column such as `versions.drake`. An empty cell means that the run lacks the field.

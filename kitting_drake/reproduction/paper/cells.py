@@ -174,8 +174,8 @@ class Training:
 
     @property
     def steps(self) -> int:
-        """The number of steps. It is the same for all methods, as in the paper. Trainings with more
-        labels or augmentation than in the paper have more steps."""
+        """The number of steps. As in the paper, it depends on the task and not on the method. More
+        labels or augmentation than in the paper, or `times`, increase it."""
         task = TASKS[self.task]
         more = 0 if self.taken_only and self.rigid else task.more_steps
         return self.times * (task.steps + more)

@@ -25,8 +25,8 @@ _MOST_ACTIONS = {
     "!PalletizingBoxes": 30,
     "!StackBlockPyramid": 12,
 }
-"""The largest number of actions of an episode, by task, for runs whose summaries do not count their
-actions. On any other task it is one action per object."""
+"""The largest number of actions of an episode, by task, for runs whose summaries do not state how
+many actions they had. On any other task it is one action per object."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Changeable:
 
     @property
     def text(self) -> str:
-        """The number of changeable actions and the number of all actions, as text."""
+        """The counts as text, such as "2 of 10" or "1 to 3 of 10"."""
         if self.at_least == self.at_most:
             return f"{self.at_most} of {self.actions}"
         return f"{self.at_least} to {self.at_most} of {self.actions}"

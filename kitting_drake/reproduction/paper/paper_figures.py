@@ -21,7 +21,7 @@ _COLOURS = {10: "#009e73", 100: "#d55e00"}
 """Green and orange as in the paper, in shades that the colour-blind can distinguish."""
 _MARKERS = {"so2": "o", "equivariant_transporter": "s", "transporter": "^"}
 _STEP = 0.12
-"""The distance between neighbouring markers with equal N. Markers for successive N are 1 apart."""
+"""The distance along x between neighbouring markers with the same N. Successive N are 1 apart."""
 _ROWS = {
     ("so2", 36): ("#e69f00", "o"),
     ("so2", 180): ("#d55e00", "D"),
@@ -31,8 +31,8 @@ _ROWS = {
 """The rows of table I (method and N), with markers and with colours that the colour-blind can
 distinguish."""
 _ROW_STEP = 0.19
-"""The distance between neighbouring markers with equal numbers of demonstrations. Markers for
-successive numbers are 1 apart."""
+"""The distance along x between the markers of neighbouring `_ROWS` at the same number of
+demonstrations. Successive numbers of demonstrations are 1 apart."""
 _STYLE = {
     "font.size": 13,
     "axes.edgecolor": "0.5",
@@ -112,7 +112,7 @@ def draw_table_1(results: Mapping[str, Result]) -> bytes:
 
     A filled marker is our result with its 95 % interval. A star is our result with extensions. A
     hollow marker is the paper's result for the same cell. A cell without a run is left out,
-    with the paper's result for it. A task without a run has no panel.
+    and so is the paper's result for it. A task without a run has no panel.
 
     Args:
         results: the results by cell name.

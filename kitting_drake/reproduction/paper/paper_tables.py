@@ -36,8 +36,8 @@ MATCHED = "matched"
 """The preset that reduces the baselines' networks by the same factor as the SO(2) networks; see
 `paper.parameter_table`."""
 ROTATIONS = 18
-"""The number of rotations (out of 36) in a training step of the Transporter in the cells of
-`_every_chance`."""
+"""In the cells of `_every_chance`, a training step of the Transporter uses this many of the 36
+rotations."""
 EVERY_CHANCE = "every_chance"
 """The label of the cells of `_every_chance`."""
 BEYOND_OF_TABLE_1 = ("stack_block_pyramid",)

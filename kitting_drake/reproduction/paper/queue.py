@@ -95,7 +95,8 @@ class Queue:
         return failures
 
     def pending(self, cells: Sequence[Cell]) -> list[Cell]:
-        """Returns the cells without a repeatable run in the table.
+        """Returns the cells to run: those without a run in the table, and those whose run used code
+        that cannot be checked out again.
 
         Raises:
             UserError: the table is damaged, or a run does not fit its cell.

@@ -19,7 +19,7 @@ IMAGE, STATE = "observation.images.front", "observation.state"
 
 
 def differing(one: torch.Tensor, other: np.ndarray) -> int:
-    """The number of different values in two float32 arrays."""
+    """The number of elements in which two float32 arrays differ."""
     read = one.numpy()
     assert read.dtype == other.dtype == np.float32, (read.dtype, other.dtype)
     assert read.shape == other.shape, (read.shape, other.shape)

@@ -45,7 +45,7 @@ class Joint:
     owner: int
     other: int
     outline: CrossSection
-    """The outline of the dovetail, in mm. It overlaps its own piece."""
+    """The outline of the dovetail, in mm. It overlaps the piece `owner` at the root."""
     height: float
     """The height of the dovetail's top above the block's bottom, in mm."""
 

@@ -44,7 +44,8 @@ _HOLE, _TOOL = 0.25, 0.4
 """Shares of a rectangle's length. Within the rectangle, a curve shorter than `_HOLE` is a hole, and
 a curve longer than `_TOOL` may be a tool."""
 _ROUND = 0.02
-"""The largest relative difference of a round curve's extents and area from those of a circle."""
+"""A curve counts as round if its extents and area differ from those of a circle by less than this
+fraction."""
 
 Points = NDArray[np.float64]
 
@@ -153,8 +154,8 @@ def _as_frame(
     if (
         frame == "tool"
         or box.area.area() < _BOX * sides.prod()
-        # Test whether the second curve is the rectangle again, and then whether it is the inner
-        # side of the rectangle's thick line.
+        # The second curve may be a copy of the rectangle, or the inner side of the rectangle's
+        # thick line.
         or box.area.area() < 1.02 * inside.area.area()
         or (box.area.offset(-_LINE_MM, JoinType.Miter) - inside.area).area()
         < 0.001 * box.area.area()

@@ -142,7 +142,7 @@ def _scale(root: ElementTree.Element, text: bytes, unit_mm: float | None) -> tup
 
 
 def _paper(sides: list[float]) -> tuple[str, float]:
-    """Finds a standard sheet of paper, and a unit in which a page has the sheet's size.
+    """Finds the unit in which a page has the size of a standard sheet of paper.
 
     Args:
         sides: the page's sides in units, the shorter first.

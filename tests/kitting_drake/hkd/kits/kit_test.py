@@ -91,7 +91,7 @@ def test_the_clearance_is_kept_all_around(tools: list[Tool], cavities: list[Cavi
         # Closing narrow notches does not affect the extremes, so the clearance is exact there.
         box, tool_box = np.array(cavity.outline.bounds()), np.array(outline.bounds())
         np.testing.assert_allclose(np.abs(box - tool_box), 0.002, atol=1.5e-4)
-        # At least half of the wall follows the tool at the clearance.
+        # Along at least half of the wall, its distance from the tool is the clearance.
         points = np.concatenate(cavity.outline.to_polygons())
         middle = (points + np.roll(points, 1, axis=0)) / 2
         length = np.linalg.norm(points - np.roll(points, 1, axis=0), axis=1)
