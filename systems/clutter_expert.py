@@ -22,8 +22,8 @@ _NEAR_BEST = 0.035
 """A grasp further than this from the object's best grasp, in metres, is used only to lay the object
 aside."""
 _ANY = math.radians(65.0)
-"""If an object has no better grasp, its gripped faces may be tilted by this from the vertical, in
-radians."""
+"""If an object has no better grasp, its gripped faces may be tilted from the vertical by at most
+this, in radians."""
 _IN_CAVITY = 0.03
 """An object displaced less than this from its goal, in metres, lies in or over its cavity."""
 
