@@ -238,7 +238,7 @@ def _commit_of_process() -> str | None:
 
 
 def _lost_episode(chosen: ChosenScenario, seed: int, failure: str, seconds: float) -> Episode:
-    """Makes the failed episode of a process that ended without a result, for the given reason."""
+    """Makes the result of an episode whose process ended without one; `failure` is the reason."""
     return EpisodeResult(
         scenario=chosen.name,
         policy=chosen.policy,

@@ -273,7 +273,7 @@ def inverse_of_flange(
     with np.errstate(invalid="ignore", divide="ignore"):
         toward = reach / distance
         at_wrist = np.arccos((distance**2 + _FORE**2 - _UPPER**2) / (2 * distance * _FORE))
-        # `between` is the angle at the wrist between the shoulder and -z5, the axis of the forearm.
+        # `between` is the angle between `toward` and -z5, the axis of the forearm.
         between = math.atan2(_A4, _D5) + _ELBOW * at_wrist
         # Compute -z5, which lies in the plane of x6 and y6.
         along_x, along_y = np.sum(toward * x6, -1), np.sum(toward * y6, -1)

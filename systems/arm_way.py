@@ -21,8 +21,8 @@ from systems.vector_view import Array, Number, VectorView
 _LINE_POINTS = 17
 """Number of points at which joint positions are computed for a straight motion of the hand."""
 _SPACING = 0.010
-"""Spacing of a path's points, in s: the time that the slowest joint takes from one to the next at
-full speed."""
+"""Spacing of a path's points, in s: the time from one point to the next, if the slowest joint moves
+at full speed."""
 _ROUNDING, _WIDER = 0.15, 0.3
 """Length of the rounded part at each corner of a path. Like `_SPACING`, it is a time, in s.
 `_WIDER` is for paths with only one corner."""
@@ -30,7 +30,7 @@ _FEWEST, _MOST = 40, 200
 """Least and largest number of points of a path."""
 _TRIES, _PATIENCE = 8, 3
 """If a path is too low, a higher one is tried, up to `_TRIES` paths in all. After try number
-`_PATIENCE`, counted from 0, each new path is raised by more than the one before."""
+`_PATIENCE`, counted from 0, the added height is doubled once more at each try."""
 _ANY_ACCELERATION = 1e3
 """Acceleration of the yaw on a straight line, in rad/s^2. It is so large that only the joints'
 limits matter."""

@@ -29,14 +29,14 @@ _SOFT, _SOFT_SHARE = 0.006, 0.2
 """If the jaws sink farther into an object than `_SOFT`, in m, or than `_SOFT_SHARE` of its width,
 they press less."""
 _MUCH_LESS = 0.85
-"""When the jaws sink into an object, small decreases of their force are ignored: a lower force must
-be at most this fraction of the present one."""
+"""When the jaws sink into an object, a lower force is used only if it is at most this fraction of
+the present one."""
 _GENTLE, _GENTLEST = 0.5, 0.25
 """Fractions of the acceleration limits. An object that may turn is moved with at most `_GENTLE` of
 them; no object is moved with less than `_GENTLEST` of them."""
 _GENTLER = 0.8
-"""Small decreases of the acceleration are ignored, because each change restarts the motion: a lower
-acceleration must be below this fraction of the present one."""
+"""A lower acceleration is used only if it is below this fraction of the present one, because each
+change restarts the motion."""
 _LEAST_CHANGE = 1.05
 """The force rises only in steps of at least this factor, so that noise does not restart its
 ramp."""
@@ -112,13 +112,14 @@ def gentleness(
 ) -> float:
     """The fraction of the acceleration limits that is used to move an object of a given weight.
 
-    It is 1 up to `heavy_load`, and inversely proportional to the weight above it. If the object may
-    turn between the pads, it is at most a half. It never rises while the object is held.
+    It is 1 up to `heavy_load`, and inversely proportional to the weight above that load. If the
+    object may turn between the pads, the fraction is at most a half. It never rises while the
+    object is held.
 
     Args:
         weight: the weight that the hand feels, in N.
         moment: the moment about the axis of the pads while the hand rests, in N m.
-        present: the present share; 0 counts as 1.
+        present: the fraction that is in use; 0 counts as 1.
         parameters: parameters with the load above which the hand is gentle.
     """
     present = present or 1.0

@@ -168,7 +168,7 @@ def motion_at(
     elapsed: float,
     legs: Sequence[Leg] = (),
 ) -> NDArray[np.float64]:
-    """State, at a given time, of the motion from a start with a given velocity to rest at a goal.
+    """The state, at a given time, of a motion that starts with a velocity and ends at rest.
 
     The motion is the sum of braking from the start velocity (see `braking_time`) and, for each of
     the `PARTS`, a `travel` over the remaining distance. Each `travel` begins after the delay of its

@@ -93,7 +93,8 @@ def _largest(
     highest: list[float], b: NDArray[np.float64], k: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """(n) the largest x = (ds/dt)^2 at each point, from one pass backwards and one forwards."""
-    # If the next point allows x <= e, this point must have x (1 - 2 k) <= e + 2 b in each row.
+    # Up to the next point, x can fall by at most 2 (b + k x) in each row. So if the next point
+    # allows x <= e, this point must have x (1 - 2 k) <= e + 2 b.
     with np.errstate(divide="ignore"):
         gain = np.where(1 - 2 * k > 0, 1 / (1 - 2 * k), _UNLIMITED)
     rise = 2 * b * gain

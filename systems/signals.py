@@ -143,10 +143,11 @@ def fill_unseen(
 ) -> NDArray[np.float32]:
     """Fills the heights of unseen pixels.
 
-    A hidden surface is lower than the surface that hides it. So a pixel of a wide hole gets the
-    height of the nearest seen pixel among the lowest ones around the hole. A narrow hole is filled
-    with the lowest neighbour, from its border inwards. Pixels outside all views, or deep in a large
-    hole, get the table's height, zero, because nothing is known about them.
+    A hidden surface is lower than the surface that hides it. So a wide hole is filled from the
+    lowest seen pixels around it: each of its pixels gets the height of the nearest of these. A
+    narrow hole is filled from its border inwards, each pixel with the height of its lowest
+    neighbour. Pixels outside all views, or deep in a large hole, get the table's height, zero,
+    because nothing is known about them.
 
     Args:
         height: (rows, cols), in metres above the table.

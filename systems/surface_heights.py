@@ -116,15 +116,15 @@ def read_surface_heights(
 
 
 def _deviation(observation: Observation) -> float:
-    """The table's largest distance from the bottom of the grid before levelling, in metres."""
+    """The largest distance between the table before levelling and the bottom of the grid, in m."""
     row, col, offset = observation.table
     rows, cols = observation.grid.shape
     return max(abs(row * i + col * j + offset) for i in (0, rows) for j in (0, cols))
 
 
 def _sunk(observation: Observation, pixel: NDArray[np.float64]) -> float:
-    """Height of the table above the bottom of the grid at a (row, col), in metres: negative if the
-    table is assumed to be lower than the grid, else 0."""
+    """Height of the table relative to the bottom of the grid at a (row, col), in metres. It is
+    negative if the table is lower by more than `_SUNK`; otherwise it is 0."""
     level = float(np.array(observation.table) @ np.append(pixel, 1.0))
     return level if level < -_SUNK else 0.0
 

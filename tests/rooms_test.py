@@ -107,7 +107,8 @@ class Tree:
     def folder(self, name: Module) -> str:
         """The folder of a module, relative to the root.
 
-        An `__init__.py` re-exports the other files of its folder, so it counts as its own folder.
+        An `__init__.py` imports the other files of its folder to re-export them. So it counts as a
+        separate folder, with the file's path as its name.
         """
         path = self.files[name]
         if self.room(name) == "verbs":

@@ -15,7 +15,8 @@ VALIDATION_SEEDS = range(20_000, 30_000)
 
 
 def seeds_from(first: int) -> range:
-    """The seeds from `first` to the end of the smallest of these ranges that contains it."""
+    """The seeds from `first` to the end of its range: the test, demonstration or validation seeds,
+    or else all seeds."""
     for seeds in (TEST_SEEDS, DEMONSTRATION_SEEDS, VALIDATION_SEEDS):
         if first in seeds:
             return range(first, seeds.stop)

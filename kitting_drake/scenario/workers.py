@@ -17,8 +17,7 @@ from kitting_drake.scenario.shipping import pack
 def add_workers_flags(parser: argparse.ArgumentParser) -> None:
     """Adds the mutually exclusive flags `--workers` and `--ray`."""
     flags = parser.add_mutually_exclusive_group()
-    # Set no default, because argparse would not detect a conflict if the given value equals the
-    # default.
+    # With a default, argparse would miss a conflict if the given value equals the default.
     flags.add_argument(
         "--workers", type=count_type, help=f"number of parallel processes ({os.cpu_count()})"
     )

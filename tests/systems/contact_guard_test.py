@@ -46,7 +46,7 @@ def test_a_load_is_known_as_it_is_lifted_but_no_more_than_the_hand_can_carry():
     assert known_payload(hand.state) == pytest.approx(-3.0 * GRAVITY)
     hand.feel((0, 0, -10.0))
     hand.state.mode = Mode.CARRY
-    # Until enough samples are taken, the payload is the force felt before the weighing.
+    # The payload stays the force that was felt last in LIFT, until CARRY has enough samples.
     hand.feel((0, 0, -12.0), times=2)
     assert known_payload(hand.state) == -10.0
     hand.feel((0, 0, -12.0), times=20)

@@ -501,7 +501,7 @@ def test_heights_come_from_the_action_or_else_from_the_observation():
 
 @pytest.mark.parametrize("tallest", [0.05, 0.16])
 def test_travel_clears_the_highest_surface(tallest: float):
-    """Only the last two centimetres of a travel may be lower: there, the goal's surfaces count."""
+    """In the last two centimetres of a travel, only the surfaces at the goal must be cleared."""
     run = Run(observation=seen(pick=0.06, place=0.03, tallest=tallest), is_logged=True).finish()
     q = run.log.FindLog(run.simulator.get_context()).data()[:3]
     times = run.log.FindLog(run.simulator.get_context()).sample_times()

@@ -45,7 +45,7 @@ class Outside:
 
 
 def grid_side(side: float) -> float:
-    """Returns the side of the smallest bin on the grid whose side is at least `side`, in mm."""
+    """Returns the side of the smallest Gridfinity bin that is at least `side` wide, in mm."""
     return PITCH * max(1, math.ceil((side + GAP) / PITCH - 1e-9)) - GAP
 
 

@@ -57,7 +57,7 @@ def _rims(faces: Faces) -> list[NDArray[np.int64]]:
     """
     edges = np.vstack([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     known = set(map(tuple, edges.tolist()))
-    # The cap runs along each edge in the opposite direction to the surface.
+    # Along a shared edge, the cap's triangle runs in the opposite direction to the surface's.
     free = [(b, a) for a, b in known if (b, a) not in known]
     following = dict(free)
     if len(following) != len(free) or set(following) != set(following.values()):

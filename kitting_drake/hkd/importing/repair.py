@@ -26,7 +26,7 @@ _MERGE_MM = 1e-3
 # Bodies that are farther apart than `_GAP_MM` are separate objects. If the largest object has at
 # least the share 1 - `_DIRT` of the volume, the others are removed; if not, the mesh is rejected.
 _GAP_MM, _DIRT = 1.5, 0.02
-# The largest share of the area of a projection along x, y or z that a repair may lose.
+# A repair may remove at most this share of the area of each projection, along x, y and z.
 _LOST = 0.03
 # The size of a pixel of the compared projections.
 _PIXEL_MM = 0.5

@@ -175,14 +175,13 @@ def _cost(length: float, width: float) -> float:
 class _Part:
     """Masks of a rotated shape, all of one size: rows along y, columns along x.
 
-    The lower left corner of the outline with its wall is at cell `inset` (row, column).
+    Cell `inset` (row, column) is the lower left corner of the outline and the wall around it.
     """
 
     def __init__(self, shape: NestedShape, yaw_deg: int, wall: float) -> None:
         self.yaw_deg = yaw_deg
-        # `solid` has every cell that the outline touches. Two shapes keep the wall between them if
-        # no cell of one's `solid` is in the other's `walled`. They respect keep-out regions if no
-        # cell of one's `solid` is in the other's `keep_out`.
+        # `solid` has every cell that the outline touches. It must not overlap another shape's
+        # `walled`, which keeps the wall between the two, nor another shape's `keep_out`.
         solid = _grown(shape.outline.rotate(yaw_deg), _REACH)
         walled = _grown(shape.outline.rotate(yaw_deg), wall + _REACH)
         keep_out = _grown(shape.keep_out.rotate(yaw_deg), _REACH)
@@ -191,7 +190,7 @@ class _Part:
         x_min, y_min, x_max, y_max = (walled + keep_out).bounds()
         self.inset = (_cells(y_low - y_min), _cells(x_low - x_min))
         self.corner = np.array([x_low, y_low])
-        """The lower left corner (x, y) of the outline with its wall, in the rotated frame."""
+        """The lower left corner (x, y) of the outline and its wall, in the rotated frame."""
         start = self.corner - CELL * np.array(self.inset[::-1])
         counts = (_cells(y_max - start[1]), _cells(x_max - start[0]))
         self.solid = rasterized(solid, start, counts)

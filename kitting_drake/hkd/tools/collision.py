@@ -48,7 +48,7 @@ def closed(profile: CrossSection, clearance: float) -> CrossSection:
 def furthest(
     inner: CrossSection, outer: CrossSection, precision: float = 0.01, area: float = _AREA
 ) -> float:
-    """Returns the largest distance of a point of `inner` from `outer`, in mm; 5 if it is larger.
+    """Returns the largest distance of a point of `inner` from `outer`, in mm, but at most 5.
 
     Args:
         inner, outer: two regions, in mm.
@@ -72,7 +72,7 @@ def thinned(
     """Selects few vertices (m, 3) whose hull is within about `tolerance` of the hull of `points`.
 
     Points on the table are selected first, so that a flat bottom stays flat. The result is rounded
-    to a grid. Facets that are nearly in one plane are then exactly in one plane or clearly not.
+    to a grid: two facets are then either exactly in one plane or clearly not.
 
     Args:
         points: the points (n, 3), in mm.

@@ -51,7 +51,7 @@ class Difference:
     """
 
     outline_deviation_mm: float
-    """The largest distance of a point of one outline from the other, in mm; 5 if it is larger."""
+    """The largest distance of a point of one outline from the other, in mm, but at most 5."""
     surface_distance_mm: float
     """The symmetric mean distance of the surfaces in mm; infinity if the outlines differ too much.
 

@@ -17,7 +17,8 @@ _NO_SHADOW = 1.3
 _BALL_MM = 0.9
 """The radius of the disc that `_reached` rolls over the ground, in mm."""
 _ROUGH = 0.022
-"""With the limits `MIDDLE`, surfaces below this roughness, in logarithms of light, are smooth."""
+"""Surfaces less rough than this, in logarithms of light, count as smooth under the limits `MIDDLE`.
+Other limits scale this value."""
 _MOST_FINE = 0.1
 _HOLE_BALL_MM = 0.6
 _STRIP_MM = 1.2
@@ -148,7 +149,7 @@ class ToolMasks:
         roughest = max(_ROUGH * look.rough / 3, look.rough * self._usual)
         even = (free & (self._rough < roughest)) | ~ground
         reached = _reached(cv2, even, self._plain, px_per_mm)
-        # If a small hole lies wholly in shadow, all of its pixels are near its edges. So use a
+        # Every pixel of a small hole is near an edge. So find holes that lie wholly in shadow by a
         # roughness that ignores edges.
         usual = _median(self._fine[self._plain & ground], _ROUGH)
         limit = 1.7 * usual * np.exp(-self._lightness / 2)

@@ -129,7 +129,7 @@ class Calibration:
     grid: PixelGrid
     """The pixels of the observation o_t; `z_min` is the height of the table in the base frame."""
     outline: TableOutline = dataclasses.field(default_factory=TableOutline)
-    """The part of the workspace that is table."""
+    """The part of the workspace where the table is."""
     verified: bool = False
     """Whether the poses' x, y and yaw, and the orientation of the images, were checked. Images of a
     bare table do not show errors in these."""

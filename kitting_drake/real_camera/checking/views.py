@@ -17,7 +17,7 @@ from systems.signals import Observation, PixelGrid
 Array = NDArray[np.float64]
 
 _LEAST_SEEN = 0.01
-"""The least share of the workspace that a camera with a correct pose sees."""
+"""If a camera sees a smaller share of the workspace than this, its pose is wrong."""
 _LEAST_DEPTH = 0.01
 """Of the pixels that look at the workspace, at least this share must have a depth."""
 _NEAREST, _FARTHEST = 0.8, 1.25

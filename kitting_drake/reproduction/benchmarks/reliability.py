@@ -46,7 +46,8 @@ _CAMERAS = {
 _RANDOM_VIEWS = 0.7
 """The share of scenes with random cameras. The other scenes have the default cameras."""
 _EVERY = 4
-"""Every fourth scene of a seed is used, because the scenes of a seed share their tools."""
+"""Only every fourth scene of a seed is used. The scenes of a seed share their tools, so using fewer
+of each seed gives more different tools."""
 _WITHOUT_KIT = 0.1
 """The share of scenes without a kit."""
 _DECISIONS = 3

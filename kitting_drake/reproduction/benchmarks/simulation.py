@@ -142,7 +142,7 @@ def _start_up_times() -> dict[str, float]:
 
 
 def _image_times(scenario: Scenario, seed: int) -> dict[str, float]:
-    """Returns the times of one RGB-D image, and of the heightmap from all cameras' images, in s.
+    """Returns the seconds to render one RGB-D image, and to make the heightmap from all cameras.
 
     Raises:
         UserError: images cannot be rendered on this machine.

@@ -82,9 +82,9 @@ def measure_pick_angles(setup: SpeedSetup, preset: str) -> list[dict[str, Any]]:
 
 
 def _cells(plan: Plan) -> Iterator[tuple[str, tuple[int, ...]]]:
-    """Yields methods, each with the values of N at which one set of networks can predict.
+    """Yields each method with the values of N for which one set of networks is enough.
 
-    A method whose architecture depends on N is yielded for one N at a time.
+    A method whose architecture depends on N is yielded once for each N.
     """
     for method in METHODS:
         if method in _MADE_FOR_N:
@@ -229,7 +229,7 @@ class _WatchedPolicy:
 
 
 def growth(rows: list[dict[str, Any]], orientations: tuple[int, ...]) -> list[dict[str, Any]]:
-    """Returns the ratio of the cost at the largest N to that at the smallest.
+    """Returns the ratios of the costs at the largest N to those at the smallest N.
 
     Args:
         rows: the rows of `measure_pick_angles` or `measure_decisions`.

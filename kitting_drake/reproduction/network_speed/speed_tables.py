@@ -63,7 +63,7 @@ def _add_by_method(
     cells: Callable[[dict[str, Any]], Iterable[str]],
     growth_cells: Callable[[dict[str, Any]], Iterable[str]],
 ) -> None:
-    """Adds lines to a table, for each method: one for each N, and one for the growth.
+    """Adds the lines of each method to a table: one for each N, and one for the growth.
 
     The growth is the ratio of the values at the largest and the smallest N.
     """

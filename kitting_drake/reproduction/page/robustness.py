@@ -184,7 +184,8 @@ def _check_seeds(found: Mapping[Key, Sequence[Run]]) -> None:
 
 
 def _common(run: Run, label: str) -> bool:
-    """Whether a run has the seeds that the cells of its table share."""
+    """Whether a run has the seeds that its table requires: all of `_SEEDS`; at the levels mild and
+    severe, at least the first `_FEWEST` of them."""
     seeds = list(run.summary["seeds"])
     if _is_other_level(label):
         return len(seeds) >= _FEWEST and seeds == list(_SEEDS)[: len(seeds)]

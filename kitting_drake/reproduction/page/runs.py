@@ -164,8 +164,8 @@ class Run:
 
     @property
     def paper_task(self) -> str | None:
-        """The title of the paper's task; None if the run departs from this task in more than the
-        policy."""
+        """The title of the task, if it is a task of the paper and the run's scenario differs at
+        most in the policy; otherwise None."""
         task = self.summary["task"]
         return task if task in PAPER_TASKS and not self.departures else None
 

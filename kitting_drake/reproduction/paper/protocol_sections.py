@@ -157,7 +157,7 @@ def _beyond_the_paper(results: Mapping[str, Result], again: Collection[str]) -> 
 
     steps = TASKS["unseen"].steps
     rows = [
-        # Cells that lack an extension were run on the unseen toolsets only.
+        # The ablations (`_minus_...`) were run on the unseen toolsets only.
         [label, text(f"unseen_{name}"), "" if "minus" in name else text(f"seen_{name}")]
         for label, name in names.items()
     ]

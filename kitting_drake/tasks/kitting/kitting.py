@@ -149,8 +149,8 @@ class _DrawnKitting(KittingTask):
 
     @property
     def not_perturbed(self) -> tuple[str, ...]:  # type: ignore[override]
-        """Names of perturbations that do not apply. Distractors need tools that lie apart on the
-        table."""
+        """Names of perturbations that do not apply. `distractors` applies only with `start: apart`
+        and `tray: false`."""
         return () if self.start == APART and not self.tray else ("distractors",)
 
     def _draw_scene(

@@ -318,8 +318,8 @@ def _without_doubles(curves: list[Points]) -> list[int]:
         for other in around[within.all(axis=1)]:
             if other not in trees:
                 trees[other] = cKDTree(_dense(curves[other], _SAME_MM))
-            # The limit includes half the spacing of the other curve's points. A short piece of a
-            # curve is close to its neighbours, so its limit is smaller.
+            # The other curve has a point only every `_SAME_MM`, so allow half of that. Allow less
+            # for a short piece, because all of it is close to the pieces that it meets.
             near = min(1.2 * _SAME_MM, 0.5 * _SAME_MM + 0.2 * lengths[index])
             if trees[other].query(places)[0].max() <= near:
                 break

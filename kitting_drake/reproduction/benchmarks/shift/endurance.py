@@ -84,7 +84,7 @@ def run_shift(
     sent: ChosenScenario,
     console: Console,
 ) -> list[ShiftScene]:
-    """Runs the scenes of a shift that are not in `folder/scenes.jsonl`, and appends each of them.
+    """Runs those scenes of a shift that `folder/scenes.jsonl` lacks, and appends each to the file.
 
     Args:
         chosen: the scenario.
@@ -251,7 +251,8 @@ class _Watch:
 
 
 def is_on_table(p_WB: Any) -> bool:
-    """Whether a point (3,) is over the table, and at most `_BELOW` below its top; false for NaN."""
+    """Whether a point (3,) is within the table's sides, and above or at most `_BELOW` below the
+    table's top. Returns False for NaN."""
     low, high = TABLE
     return bool(np.all(p_WB[:2] >= low) and np.all(p_WB[:2] <= high) and p_WB[2] > -_BELOW)
 

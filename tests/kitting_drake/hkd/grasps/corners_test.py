@@ -67,7 +67,7 @@ def test_a_corner_beside_the_opposite_face_would_turn():
     corner += np.abs(np.arange(columns) - 17)[:, None] * 0.001 + 0.05
     face[:] = 0.0
     assert corner_cost(face, corner, 0.0005, 0.0003) == pytest.approx(0.5)
-    # The face recedes opposite the corner, so the corner cannot be held against it.
+    # The face touches its pad only beside the corner; opposite the corner, it recedes.
     face[16:] = -0.005
     assert corner_cost(face, corner, 0.0005, 0.0003) is None
     # A tool that tapers toward one end of the pads, and one that tapers too much.

@@ -65,7 +65,8 @@ def test_a_fresh_tool_is_unlike_all_others_of_its_category(name: str):
         if other.category == tool.category
     }
     nearest = min(distances, key=distances.__getitem__)
-    # Fewer points than in the next test give larger distances, so the limit is larger.
+    # This test samples fewer points than the next one. The measured distances are then larger, so
+    # the limit is larger, too.
     assert distances[nearest] > 0.0016, nearest
 
 

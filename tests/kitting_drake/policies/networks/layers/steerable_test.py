@@ -67,7 +67,7 @@ def test_rotations_by_90_degrees_are_exact(fibre_in: Fibre, fibre_out: Fibre, si
     expected = rotate_fields(rotate_by_90(layer(features)), fibre_out)
     found = layer(rotate_fields(rotate_by_90(features), fibre_in))
     torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-5)
-    # The outputs are not equal merely because they are zero.
+    # If all outputs were zero, their equality would prove nothing.
     assert expected.std() > 0.1
 
 
