@@ -308,12 +308,12 @@ class _Recorder:
         lowest = state.table_z + self._parameters.floor_clearance
         if mode == Mode.LOWER:
             # Lower the object to the surface that o_t shows at the place, not to the table. The
-            # fingers may meet the rim before that, and no contact stops them here.
+            # fingers go at most down to the rim, because a trajectory does not stop at a contact.
             hanging = max(state.grasp_z - state.support_z, 0.0)
             goal = max(state.floor_z + hanging, state.rim_z + state.doubt)
             motion.back_off(state, max(goal - lowest, 0.0))
         elif mode == Mode.DESCEND and state.press:
-            # No contact stops the hand here, so keep its goal above the table.
+            # A trajectory does not stop at a contact, so keep the hand's goal above the table.
             goal = state.pick_top_z - self._parameters.press_depth
             motion.back_off(state, max(lowest - goal, 0.0))
         elif mode == Mode.RELEASE:

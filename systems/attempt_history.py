@@ -120,7 +120,7 @@ class LeftOverVector:
         self._vector = vector
 
     def write(self, left_over: LeftOver | None) -> None:
-        """Stores a `LeftOver`: at most `MOST_LEFT_OVER` objects and at most as many cavities."""
+        """Stores a `LeftOver`, but at most `MOST_LEFT_OVER` of its objects and of its cavities."""
         self._vector[:] = np.nan
         self._vector[0] = left_over is not None
         if left_over is None:

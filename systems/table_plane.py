@@ -16,8 +16,8 @@ _BIN = 0.001
 _FAR = 0.03
 """The table is sought up to this distance above and below the bottom of the grid, in metres."""
 _BAND = 0.004
-"""A pixel belongs to a plane if it is nearer to the plane than this, in metres, or than three times
-the noise."""
+"""A pixel belongs to a plane if their distance is less than this, in metres, or less than three
+times the noise."""
 _FITS = 8
 """Number of fits of the plane. In the first half of the fits, the area grows from the middle of the
 grid to the whole grid, and the limit of `_BAND` is doubled."""

@@ -102,9 +102,9 @@ def _onto(raw: dict, defaults: Scenario) -> tuple[dict, Scenario]:
     """Returns the YAML and the defaults, prepared for merging.
 
     Drake reads an untagged mapping as the first type of a union. This function therefore adds the
-    tag of the default's type. If the YAML selects another type of task, that type has default
-    mappings of its own; mappings in the YAML replace them. Cameras that are null in the YAML are
-    removed from both.
+    tag of the default's type. If the YAML selects another type of task, the defaults get the
+    default task of that type. Mappings in the YAML then replace this task's mappings. Cameras that
+    are null in the YAML are removed from both.
 
     Raises:
         UserError: a camera that is null does not exist.

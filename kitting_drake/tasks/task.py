@@ -81,7 +81,7 @@ class Arrivals:
     """
 
     objects: tuple[int, ...]
-    """Indices of the scene's objects, in the order of appearance."""
+    """Indices of the scene's objects, in the order in which they appear."""
     poses: tuple[RigidTransform, ...]
     """X_WB at which each object appears, at rest in the air."""
     area: tuple[tuple[float, float], tuple[float, float]]

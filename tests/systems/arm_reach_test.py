@@ -64,7 +64,8 @@ def search(limits: ArmLimits, pose: NDArray, rng: np.random.Generator) -> bool:
 
 
 def disagreements(limits: ArmLimits, poses: int, seed: int) -> tuple[list[str], int]:
-    """The poses about which the methods differ, as texts, and how many the closed form reaches."""
+    """The poses about which the methods differ, as texts, and the number of the poses that the
+    closed form reaches."""
     rng, postures = np.random.default_rng(seed), ArmPostures(limits, BASE)
     reached, found = 0, []
     for _ in range(poses):

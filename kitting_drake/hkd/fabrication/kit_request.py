@@ -165,9 +165,9 @@ def _lengths(request: KitRequest) -> KitParameters:
 
 
 def _clearance_of(request: KitRequest, loaded: Mapping[str, Tool]) -> dict[str, float]:
-    """Returns the clearances of single tools, in metres, by the tools' names.
+    """Returns the clearances of tools that have their own, in metres, by the tools' names.
 
-    These tools are those in `fit_of`, and those whose outline is uncertain.
+    These are the tools in `fit_of`, and those whose outline is uncertain.
 
     Raises:
         UserError: the kit has no such tool, or a clearance is out of range.

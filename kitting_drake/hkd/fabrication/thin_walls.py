@@ -21,7 +21,7 @@ _TINY = 1e-9
 
 
 def wall_notes(design: Design, nozzle: float) -> list[str]:
-    """Returns a sentence for each wall of a block that is missing or thinner than a nozzle.
+    """Returns a sentence for each missing wall of a block, and for each wall thinner than a nozzle.
 
     Args:
         design: the block.

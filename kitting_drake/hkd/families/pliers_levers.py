@@ -43,8 +43,8 @@ class Levers:
     joint_front_mm: float = 9.0
     # The distance from the rivet to the end of the handles.
     handle_length_mm: float = 130.0
-    # The distances between the middle lines of the handles at the shoulder and at the ends. Then
-    # the position of the shoulder as a share of a handle's length.
+    # The distances between the middle lines of the handles at the shoulder and at the ends, and the
+    # shoulder's position (0: at the end of the parallel part, 1: at the end of the handle).
     spread_mm: float = 42.0
     end_spread_mm: float = 44.0
     shoulder_share: float = 0.4

@@ -127,7 +127,7 @@ def _shank_cells(p: WrenchParameters) -> list[CrossSection]:
     """
     half, far = p.center_distance_mm / 2, 100.0
     if p.swing_mm:
-        # The bends belong to the cells at the ends, because jaws grip the middle cell.
+        # Cut just inside the bends, so that the middle cell, where jaws grip, is almost straight.
         bend = _BEND * half - 0.7
         return [_rectangle(-bend, bend), *_swung_ends(p, bend)]
     joints: list[float] = []

@@ -272,7 +272,7 @@ class _GripReport:
 
 
 def _measure_grasp(entry: ToolEntry, solid: Manifold) -> _GripReport:
-    """Measures the annotated grasp of a tool, whose solid is in its frame T, in mm.
+    """Measures the annotated grasp of a tool. The solid is in the tool's frame T, in mm.
 
     Raises:
         CatalogueError: the jaws cannot hold the tool by this grasp.

@@ -22,11 +22,11 @@ CELL = 0.0015
 """The side of a raster cell, in metres."""
 
 PREFERRED_SIDE = 0.42
-"""The longest side of a rectangle, in metres, unless the shapes need a longer one."""
+"""The rectangle's sides are at most this long, in metres, unless the shapes need more."""
 
 USUAL_SIDES = (0.48, 0.95)
-"""The largest sides, in metres, unless the shapes need more. They fit into the usual workspace of
-0.5 by 1 m with a margin."""
+"""The largest sides, in metres, for shapes that need more than `PREFERRED_SIDE`. Such a rectangle
+fits into the usual workspace of 0.5 by 1 m with a margin."""
 
 LONGEST_SIDES = (0.90, 1.20)
 """The sides of the largest rectangle, in metres. It covers most of the table of 1.0 by 1.5 m."""
@@ -37,7 +37,7 @@ _WIDTHS = (1.0, 0.9, 1.1, 0.8, 1.25, 1.45)
 _EXPECTED_USE = 0.60
 """The expected ratio of the area of the outlines with their walls to the rectangle's area."""
 _ELONGATION_COST = 0.10
-"""A rectangle with sides of 2 to 1 costs more than a square of equal area by this fraction."""
+"""The fraction by which a rectangle with sides of 2 to 1 costs more than a square of equal area."""
 _ARC_SEGMENTS = 64
 _REACH = 1.02 * CELL / math.sqrt(2)
 """The largest distance of a point from the centre of its cell, with a margin for rounding."""

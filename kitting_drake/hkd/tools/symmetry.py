@@ -133,9 +133,8 @@ def _surface_distance(
 ) -> float:
     """Returns the mean distance in mm between a surface and its rotated and shifted copy.
 
-    The shift is the one with the least distance. Its search begins at `start`. If the least
-    distance is at least `MOST_SURFACE_DISTANCE_MM`, the result may be only a lower bound of it,
-    unless `complete` is set.
+    The shift is chosen to minimize this distance, by a search from `start`. A result of at least
+    `MOST_SURFACE_DISTANCE_MM` may be only a lower bound of the minimum, unless `complete` is set.
     """
     faces = np.arange(3 * len(triangles)).reshape(-1, 3)
     mesh = trimesh.Trimesh(triangles.reshape(-1, 3), faces, process=False)

@@ -114,8 +114,8 @@ def focal_of_height(homography: Array, height: float, start_px: float, center: A
         center: (2,) the principal point in pixels.
     """
     focal = start_px
-    # Iterate, because the camera's height is proportional to the focal length only if the camera
-    # looks straight at the plane.
+    # The camera's height is proportional to the focal length only if the camera looks straight at
+    # the plane. Otherwise one step is not enough, so iterate.
     for _ in range(20):
         focal *= height / view_of(homography, focal, center).camera[2]
     return focal

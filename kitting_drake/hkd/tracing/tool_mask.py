@@ -85,9 +85,9 @@ raised."""
 
 
 def look_for(height: float | None, px_per_mm: float) -> ShadowLook:
-    """Returns the limits that suit the height of the tools and the resolution of the photo.
+    """Returns the limits for a height of the tools and a resolution of the photo.
 
-    `CAREFUL` does not suit a coarse photo, in which a shadow's edge is as rough as a tool.
+    `CAREFUL` is not used for a coarse photo, in which a shadow's edge is as rough as a tool.
 
     Args:
         height: the tools' height in mm; None: unknown.

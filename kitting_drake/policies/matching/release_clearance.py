@@ -28,8 +28,7 @@ _SUPPORT_REACH = 0.06
 """Half the side, in metres, of the square around the pick in which the height of the object's
 support is estimated."""
 _SUPPORT_PERCENTILE = 10.0
-"""The percentile of the heights around the pick that is taken as the height of the object's
-support."""
+"""This percentile of the heights around the pick is taken as the height of the object's support."""
 _UNDER = 0.009
 """Half the side, in metres, of a square around the place. Its highest point is taken as the height
 of the support there."""

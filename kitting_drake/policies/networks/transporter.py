@@ -251,8 +251,8 @@ def draw_bins(
         step: the angle between neighbouring bins, in radians.
         random: the generator that draws the other bins.
         rotations: the number of bins to return, including the labels. Half of the drawn bins are
-            near a label, if so many exist. Two bins are drawn in each stratum if this is None, and
-            at least two otherwise.
+            near a label, if so many exist. At least two bins are drawn in each stratum. None: two
+            bins are drawn in each stratum.
 
     Returns:
         A dict from bins to log weights in nats. Adding these to the logits makes the drawn bins

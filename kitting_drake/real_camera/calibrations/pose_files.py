@@ -31,8 +31,8 @@ Array = NDArray[np.float64]
 _ROUNDED = 2e-3
 """The tolerance for the length of a quaternion that tf2_echo printed with three decimals."""
 _STILL = 2e-3
-"""The largest difference between the poses that tf2_echo prints repeatedly for a frame at rest. It
-holds for positions in metres and for the numbers of a quaternion."""
+"""tf2_echo prints a frame's pose repeatedly. The poses may differ by at most this, in metres and in
+the numbers of the quaternion. Otherwise the frame was not at rest."""
 _NUMBERS = r"\[\s*([^\]]*?)\s*\]"
 _ECHO = re.compile(rf"Translation:\s*{_NUMBERS}.*?in Quaternion(?:\s*\(xyzw\))?\s*{_NUMBERS}", re.S)
 _ECHO_CALL = re.compile(r"\btf2?_echo[ \t]+([\w/.-]+)[ \t]+([\w/.-]+)")

@@ -38,9 +38,9 @@ wrong, the table looks tilted."""
 MOST_TILT = math.radians(1.3)
 """The largest tilt of a table, in radians, that `decide` accepts."""
 _STEP = 2
-"""Only every `_STEP`th row and column of an image is used."""
+"""Only the rows and columns of an image at multiples of this are used."""
 _REACH = 2.0
-"""Points farther than this from the robot's base, along x or y, in metres, are ignored."""
+"""Points farther than this from the robot's base along x or y, in metres, are ignored."""
 _LEAST_SHARE = 0.1
 """The least share of the points that must lie on the table."""
 _LEAST_POINTS = 500

@@ -23,8 +23,8 @@ from kitting_drake.real_camera.markers.board_poses import BoardFit, fit_board
 from kitting_drake.real_camera.markers.boards import Board, SeenBoard, find_corners
 
 _MOVED = 0.5
-"""The board or the camera has moved if the error with one pose for all images exceeds the largest
-error with a pose for each image by more than this, in pixels."""
+"""The board or the camera moved if the corners' error with one pose for all images exceeds their
+error with a separate pose for each image by more than this, in pixels."""
 
 
 @dataclass(frozen=True)

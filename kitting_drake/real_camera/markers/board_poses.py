@@ -25,8 +25,8 @@ corners are poor."""
 _SAME = math.radians(1)
 """The angle in radians below which two poses count as the same."""
 _CLEARER = 16.0
-"""A pose is ambiguous if another pose fits almost as well: its sum of the corners' squared errors
-is larger by less than this multiple of the error variance of one corner."""
+"""The sums of the corners' squared errors of two poses must differ by at least this multiple of the
+error variance of one corner. Otherwise the pose is ambiguous."""
 _LIKELY = 0.2
 """The test for ambiguous poses assumes that the corners' error is at least this, in pixels."""
 _NOISE = 0.05

@@ -30,8 +30,8 @@ _CONTACT_TIME = 0.004
 """MuJoCo's time constant of contact, in s. It is short, for stiff contact, but must be at least
 twice the time step."""
 _FRICTION = 0.375
-"""The friction between tool and kit: the harmonic mean of 0.5 and 0.3, as in Drake. MuJoCo would
-use the larger one."""
+"""The friction between tool and kit: the harmonic mean of their coefficients 0.5 and 0.3, as in
+Drake. MuJoCo would use the larger coefficient."""
 
 _MOST_FRUITLESS = 5
 """The benchmark fails after this many episodes in a row without a release."""

@@ -52,7 +52,8 @@ class Plan:
     """The side of the matrices whose product gives the peak rate. On an accelerator it is four
     times as long."""
     budget: float = 60.0
-    """The time for each number, in seconds. Measurements that would take longer are skipped."""
+    """The time in seconds after which a function is not run again. A function is skipped if one run
+    is expected to take longer."""
     demonstrations: Path | None = None
     """The file from which to take the observation; None for a synthetic one."""
 

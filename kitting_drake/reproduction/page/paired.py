@@ -1,7 +1,7 @@
-"""Computes paired differences of two runs on the same seeds, and intervals of a rate over tools.
+"""Computes paired differences of two runs on the same seeds, and rates, with bootstrap intervals.
 
-Both intervals are bootstrap intervals. They are too narrow where few episodes differ or few tools
-fail.
+The interval of a difference is over episodes, and is too narrow where few episodes differ. The
+interval of a rate is over tools, and is too narrow where few tools fail.
 """
 
 from collections import defaultdict
@@ -35,7 +35,7 @@ class Estimate:
 def paired_difference(
     first: Mapping[str, Any], second: Mapping[str, Any], rate: str
 ) -> Estimate | None:
-    """Computes how much better one run is than another, on the seeds that both ran.
+    """Computes how much higher the first run's rate is than the second's, on their common seeds.
 
     The interval is a bootstrap over episodes. Each resampled episode has the rates of both runs, so
     scenes that are hard for both cancel. The interval does not include the variation between

@@ -34,7 +34,7 @@ def read_summaries(folder: Path) -> dict[str, Summary]:
     """Returns the summaries of all runs, by name; empty if there are no files.
 
     Raises:
-        UserError: a file is damaged, or the two files do not have the same runs.
+        UserError: a file is damaged, or `TABLE` and `EPISODES` do not have the same runs.
     """
     rows, lines = _read_table(folder / TABLE), _read_lines(folder / EPISODES)
     for name in sorted(rows.keys() ^ lines.keys()):
@@ -47,7 +47,7 @@ def read_summaries(folder: Path) -> dict[str, Summary]:
 
 
 def add_run(folder: Path, name: str, summary: Mapping[str, Any]) -> None:
-    """Adds a run to both files; creates them if necessary.
+    """Adds a run to `TABLE` and `EPISODES`; creates these files if necessary.
 
     Args:
         folder: the folder of the files.

@@ -219,7 +219,7 @@ class Cell:
 
     task: str
     policy: Training | str
-    """The training of the policy's networks; for any other policy, its YAML in a scenario."""
+    """The training of the policy's networks; for a policy without networks, its YAML text."""
     orientations: int | None
     """The number N of orientations at inference; None if the policy has none."""
     label: str = ""

@@ -31,8 +31,8 @@ many actions they had. On any other task it is one action per object."""
 
 @dataclass(frozen=True)
 class Changeable:
-    """Bounds on the number of actions that the memory of failed grasps can have changed, and the
-    number of all actions."""
+    """The number of actions that the memory of failed grasps can have changed is between `at_least`
+    and `at_most`. The number of all actions is `actions`."""
 
     at_least: int
     at_most: int
@@ -61,10 +61,10 @@ def changeable(summary: Mapping[str, Any]) -> Changeable:
 
     - At least F - n actions follow a failed grasp: in each episode, every failed grasp except the
       first follows an earlier one.
-    - The most actions follow a failed grasp if n episodes begin with a failed grasp. The other
-      episodes need at least one action for each placed object. So the bound is the number of all
-      actions, minus n, minus the least number of objects placed in any E - n episodes. The bound is
-      also at most the number of actions that the task allows in n episodes, minus n.
+    - The number of actions after a failed grasp is largest if n episodes begin with a failed grasp.
+      The other episodes need at least one action for each placed object. So the bound is the number
+      of all actions, minus n, minus the least number of objects placed in any E - n episodes. The
+      bound is also at most the number of actions that the task allows in n episodes, minus n.
 
     Args:
         summary: the summary that `evaluate` wrote for a learned policy. If it has no number of

@@ -89,8 +89,8 @@ class StartCheck:
         }
 
     def may_settle(self, X_WTools: Sequence[RigidTransform]) -> bool:
-        """Whether it is worth simulating how tools settle from random poses. Only the kind
-        `touching` is checked, because its tools hardly move."""
+        """Whether it is worth simulating how tools settle from random poses. Touching tools hardly
+        move, so they must already be graspable. Other kinds are always simulated."""
         return self._kind != "touching" or self._is_graspable(X_WTools)
 
     def may_go_on(self, X_WTools: Sequence[RigidTransform]) -> bool:

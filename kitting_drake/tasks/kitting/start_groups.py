@@ -25,7 +25,7 @@ _SPLAY = math.radians(6.0)
 _CROSSING = (math.radians(50.0), math.radians(130.0))
 """Range of the angle between crossed tools, in radians."""
 _CROSSING_SHARE = 0.2
-"""Two tools cross at most this far from the middle of each, as a share of the tool's length."""
+"""Tools cross at most this far from each tool's middle, as a share of that tool's length."""
 _LIFT = 0.002
 """Height from which a tool falls onto the one below it, in metres."""
 

@@ -31,18 +31,17 @@ TAB_REACH = 8.0
 
 _CELL = 0.5
 """The side of a raster cell, in mm."""
-# Costs of a cut per mm of its length: through solid material, along a wall, across a cavity,
-# through a label.
+# Costs per mm of a cut through solid material, along a wall, across a cavity, and through a label.
 _SOLID, _WALL, _CAVITY, _LABEL = 1.0, 30.0, 12.0, 8.0
 _FOOT, _FOOT_SIDE, _OFF_THE_MIDDLE = 3.0, 8.0, 2.0
-"""Additional costs of a cut per mm of its length: through a foot, and along a foot's side. Between
-two feet, `_OFF_THE_MIDDLE` is added for each mm of the cut's distance from the middle."""
+"""Additional costs per mm of a cut through a foot, and of a cut along a foot's side. Between two
+feet, `_OFF_THE_MIDDLE` is added for each mm of the cut's distance from the middle."""
 _ROOMY = 4.0
 """Where possible, cuts stay at least this far from cavities, in mm."""
 _STEEPEST = 4
 """The largest sideways step of a cut for each step forward, in cells."""
 _UPRIGHT_ENDS = 6.0
-"""Over this length from each of its ends, in mm, a cut is perpendicular to the block's side."""
+"""A cut is perpendicular to the block's side over this length from each of its ends, in mm."""
 _REPAIRS = 8
 """The largest number of attempts to find cuts that leave no thin wall."""
 _BARRED = 400.0

@@ -192,7 +192,7 @@ def _show(
 
 
 def _in_worker(workers: Workers, chosen: ChosenScenario, seed: int) -> ShiftScene:
-    """Runs a scene in another process, and once more if this process is killed from outside."""
+    """Runs a scene in a worker process, and once more if that process is killed from outside."""
     start = time.perf_counter()
     outcome = workers.run(_run_scene, chosen, seed)
     if isinstance(outcome, ProcessCrashed) and outcome.was_killed:

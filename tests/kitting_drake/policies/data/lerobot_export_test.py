@@ -263,5 +263,5 @@ def test_lerobot_reads_what_was_written(sources: list[Path], tmp_path: Path, par
     assert set(result["differences"].values()) == {0}, result
     assert result["statistics_difference"] < 1e-6
     assert result["second_episode"] == [4, 5]
-    # ACT and diffusion policies read the next actions as chunks. All their values are as expected.
+    # ACT and diffusion policies read actions in chunks. No value of the chunks is wrong.
     assert result["next_actions"] == 0
