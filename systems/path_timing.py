@@ -80,8 +80,7 @@ def fastest_times(
 
 
 def _solvable(b: NDArray[np.float64], k: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(n) at each point, the largest x for which one u meets the limits |u + k x| <= b of all
-    rows."""
+    """(n) at each point, the largest x for which there is a u with |u + k x| <= b in all rows."""
     gap = k[:, :, None] - k[:, None, :]
     room = b[:, :, None] + b[:, None, :]
     with np.errstate(divide="ignore", invalid="ignore"):

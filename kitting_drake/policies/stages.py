@@ -24,11 +24,10 @@ from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import wrap_to_pi
 
 _AS_GOOD = 2.0
-"""A rotation counts as equally good if its score is at most this many nats below the best score and
-its place is within `_SAME_PLACE` of the best rotation's place."""
+"""A rotation counts as equally good if its score is at most this many nats below the best score,
+and its place is within `_SAME_PLACE` pixels of the best rotation's place."""
 _SAME_PLACE = 4.0
-"""The largest distance, in pixels, of an equally good rotation's place from the best rotation's
-place; see `_AS_GOOD`."""
+"""See `_AS_GOOD`."""
 _TRIES = 4
 """The policy stops after this many proposals whose pick or place is not seen well enough."""
 _ANOTHER = 0.010

@@ -36,7 +36,7 @@ from systems.signals import wrap_to_pi
 Array = NDArray[np.float64]
 
 _WORST_COST = 0.0016
-"""The largest mean difference of the outlines, in metres, in an accepted fit."""
+"""A fit is accepted if the mean difference of the outlines is at most this, in metres."""
 _HALF_TURN_GAIN = 0.00005
 """Another fit replaces the fit at the predicted rotation only if it is better by more than this, in
 metres (see `preference`)."""
@@ -54,7 +54,7 @@ _LEVER = 0.03
 """When grasps are compared, a rotation of the jaws by one radian counts as much as a shift by this
 many metres."""
 _FARTHEST_GRASP = 0.04
-"""The largest distance, in metres, of a refined grasp from the predicted one."""
+"""A refined grasp is at most this far from the predicted one, in metres."""
 _POOR = 0.03
 """When grasps are compared, a grasp cost of one counts as much as a shift by this many metres."""
 _MUCH_WORSE = 0.5

@@ -37,8 +37,8 @@ _ROBUST = 0.002
 """In the cost, residuals are capped at this many metres. Larger ones come from hidden or touching
 parts."""
 _WORST_REVERSE = 0.0025
-"""An object fills a recess only if the recess's points are on average nearer than this, in metres,
-to the object's outline."""
+"""An object fills a recess if the recess's outline is nearer than this to the object's outline on
+average, in metres."""
 _LARGEST_OFFSET = 0.004
 """The offset of the outlines is clipped to plus or minus this many metres."""
 _OFFSET_WITHIN = 0.0025

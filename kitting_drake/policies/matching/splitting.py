@@ -49,8 +49,7 @@ apart, in metres."""
 _SHARED = 0.45
 """At least this fraction of an object's outline must coincide with the region's outline."""
 _COST = 0.0010
-"""The coinciding points must lie, on average, at most this far from the region's outline, in
-metres."""
+"""The coinciding points must be this near to the region's outline on average, in metres."""
 _UNEXPLAINED = 0.15
 """If the objects found in a region leave more than this share of its area uncovered, they must all
 agree clearly with the region's outline (`_CLEARLY`)."""

@@ -28,7 +28,7 @@ from kitting_drake.real_camera.recordings.recording import (
 Images = tuple[NDArray[np.uint8], NDArray[np.float32]]
 
 _TOGETHER = 0.05
-"""The largest difference in time between the images of a frame, in seconds."""
+"""The times of the images of a frame differ by at most this, in seconds."""
 _ALIGNED = re.compile(r"aligned_depth_to_color|depth_registered|depth_to_rgb|registered_depth")
 _COLOUR = re.compile(r"colou?r|rgb")
 _REALSENSE = re.compile(r"/device_\d+/sensor_\d+/")

@@ -19,8 +19,8 @@ Array = NDArray[np.float64]
 
 CLOUD_ENDINGS = (".ply", ".pcd")
 _OFF = 2.0
-"""The largest median distance, in pixels, between the points of an organised cloud and their
-pixels. If it is larger, the cloud belongs to another lens."""
+"""If the median distance between the points of an organised cloud and their pixels exceeds this, in
+pixels, the cloud belongs to another lens."""
 _METRES = 50.0
 """If the median depth exceeds this, in metres, the cloud is probably in millimetres."""
 

@@ -12,8 +12,7 @@ DRAKE_CONFIGS = (CameraConfig, MeshcatParams, MultibodyPlantConfig)
 
 
 def struct_fields(schema: Any) -> dict[str, Any] | None:
-    """The types of the fields of one of Drake's structs, by the field's name; None for any other
-    type."""
+    """If `schema` is a struct of Drake, the types of its fields by name; otherwise None."""
     fields = getattr(schema, "__fields__", None)
     return None if fields is None else {item.name: item.type for item in fields}
 

@@ -79,8 +79,8 @@ def corner_poses(size: tuple[float, float, float]) -> list[RigidTransform]:
 
 
 def _marker_footprint(size: tuple[float, float, float]) -> Footprint:
-    """The footprint of the marker, of all poses of the box at the marker, and of the hand that
-    places it."""
+    """A footprint that covers the marker, the box in all its poses at the marker, and the hand that
+    places the box."""
     longest = max(size[:2])
     side = max(_ARM_LENGTH - _ARM_WIDTH, longest)
     middle = (side - _ARM_WIDTH) / 2

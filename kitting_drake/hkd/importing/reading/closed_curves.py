@@ -44,8 +44,7 @@ _HOLE, _TOOL = 0.25, 0.4
 """Shares of a rectangle's length. Within the rectangle, a curve shorter than `_HOLE` is a hole, and
 a curve longer than `_TOOL` may be a tool."""
 _ROUND = 0.02
-"""A curve counts as round if its extents and area differ from those of a circle by less than this
-fraction."""
+"""A curve is round if its extents and area differ from a circle's by less than this fraction."""
 
 Points = NDArray[np.float64]
 
