@@ -173,7 +173,8 @@ class ArmPostures:
         best: list[NDArray[np.float64]] = []
         least = math.inf
         for half_turn in (0, 1):
-            # The time and the postures of the fastest way to each option of the previous stop.
+            # For each possible posture at the previous stop: the fastest way to this posture, as
+            # (time, postures).
             ways = [(0.0, [now])]
             for found in options:
                 following = []

@@ -31,8 +31,8 @@ Points = NDArray[np.float64]
 _CELL = 0.004
 """Side of the squares in which the heights of objects are compared, in metres."""
 _ABOVE = 0.002
-"""A tolerance in metres. In a square, an object counts as above another one if its lowest point is
-higher than the other's highest point minus this."""
+"""In a square, an object counts as above another one if its lowest point is higher than the other's
+highest point, or lower by less than this, in metres."""
 _LEAST_SQUARES = 2
 """An object lies on another one if it counts as above the other in at least this many squares."""
 _FLAT = math.radians(2.5)

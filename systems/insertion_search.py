@@ -12,8 +12,8 @@ _SPIRAL = tuple(
     (math.sqrt(n / 16) * math.cos(n * _GOLDEN), math.sqrt(n / 16) * math.sin(n * _GOLDEN))
     for n in range(1, 17)
 )
-"""The position offsets (x, y) that the search tries next, as fractions of `reach`: a spiral of
-evenly spread points, from the middle outward."""
+"""The position offsets (x, y) that the search tries after the yaw offsets, as fractions of `reach`:
+a spiral of evenly spread points, from the middle outward."""
 _LEAST_RIM = 0.004
 """Least height of a cavity's rim above the table, in metres. It exceeds the noise of heights in
 the observation o_t."""

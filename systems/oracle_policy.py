@@ -374,8 +374,8 @@ class OraclePolicy(LeafSystem):
         if quantizer is not None:
             pick = PlanarPose(*quantizer.position(pick.x, pick.y), quantizer.angle(pick.theta))
             held = grasp_taken(X_WB, pick)
-        # The held object is level, also over a tilted cavity. So it cannot have the (x, y) of the
-        # goal pose at all heights: match them at half of the object's height.
+        # The hand holds the object level, even over a tilted cavity. So its (x, y) can match the
+        # goal pose at one height only: choose half of the object's height.
         height = plan.grasp.surface_height / 2 if is_tilted(plan.X_WGoal) else 0.0
         place = gripper_pose(plan.X_WGoal, held, height)
         theta = wrap_to_pi(pick.theta)

@@ -50,7 +50,7 @@ class PlannerState(VectorView):
     table_z = Number()
     support_z = Number()
     rim_z = Number()
-    """Least possible height of the rim around the place."""
+    """Lower bound of the height of the rim around the place."""
     floor_z = Number()
     doubt = Number()
     """The uncertainty of the surface heights."""
@@ -69,7 +69,7 @@ class PlannerState(VectorView):
     payload = Number()
     """The vertical force of the payload on the hand, in N; negative or zero."""
     felt_payload = Number()
-    """The vertical force of the payload, in N, as last measured before the payload was weighed."""
+    """An estimate of `payload`, in N, which is updated until the weighing begins."""
     weighings = Number()
     """Number of samples in the mean that gives `payload`."""
     beyond = Number()

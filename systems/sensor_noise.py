@@ -144,10 +144,10 @@ class SensorNoise(LeafSystem):
             parameters: the parameters of the noise.
             camera: the sensor's depth camera.
             seed: the seed of all draws.
-            number: number of the camera, so that each has its own noise; the cameras' shared error
-                does not depend on it.
-            workspace_middle: (x, y) in the world about which the cameras' shared error rotates, in
-                metres.
+            number: number of the camera. With `seed`, it determines the camera's own errors, but
+                not the pose error common to all cameras.
+            workspace_middle: (x, y) in the world, in metres, about which the common pose error
+                rotates the cameras.
             use_labels: whether to declare the input port `label_image`.
         """
         super().__init__()

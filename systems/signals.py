@@ -271,7 +271,7 @@ class PickPlaceAction:
     press: bool = False
     """Whether the hand only pushes down at the pick with closed jaws. The place is then ignored."""
     aside: bool = False
-    """Whether the object is laid on a free part of the table instead of into its goal."""
+    """Whether the object is laid on a free part of the table instead of moved to its goal."""
     left_over: LeftOver | None = None
     """The objects and cavities that a policy still sees when it stops; None if it does not report
     them."""

@@ -34,12 +34,12 @@ average."""
 _FLAT = 0.012
 """Squares whose heights range over more than this, in metres, contain edges and are not flat."""
 _NOISY_RIM_SHARE, _NOISY_RIM_BIAS = 90.0, 1.0
-"""With noise, the rim's height is estimated by a percentile of the heights around the place. About
-two thirds of these heights belong to the rim. The numbers are the percentile, and the estimate's
-bias in standard deviations of the noise."""
+"""With noise, the rim's height is estimated as this percentile of the heights around the place,
+minus this many standard deviations of the noise. About two thirds of the heights belong to the
+rim."""
 _NOISY_FLOOR_SHARE, _NOISY_FLOOR_BIAS = 25.0, -0.67
-"""With noise, the floor's height is estimated by a percentile of the heights at the place. The
-numbers are this percentile, and the estimate's bias in standard deviations of the noise."""
+"""With noise, the floor's height is estimated as this percentile of the heights at the place, minus
+this many standard deviations of the noise."""
 _SUNK = 0.003
 """A table that looks lower than expected by more than this, in metres, is taken to be really lower.
 Any other deviation counts as a calibration error."""

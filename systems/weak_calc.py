@@ -1,4 +1,4 @@
-"""Creates callbacks of output ports that do not keep their system alive."""
+"""Creates callbacks for output ports. The callbacks do not keep their system alive."""
 
 import weakref
 from collections.abc import Callable

@@ -110,7 +110,7 @@ def _applies(name: str, scenario: Scenario) -> bool:
 
 
 def _keep_worse(overlay: dict[str, Any], found: object) -> None:
-    """Replaces each number in `overlay` by the scenario's own if the latter perturbs more."""
+    """Replaces numbers in `overlay` by the scenario's own numbers where those perturb more."""
     for name, value in overlay.items():
         given = getattr(found, name)
         if isinstance(value, dict) and dc.is_dataclass(given):

@@ -11,7 +11,7 @@ PICK = PlanarPose(0.5, 0.1, 0.0)
 
 
 def width(*bars: tuple[float, float, float], pick: PlanarPose = PICK, top: float = 0.02) -> float:
-    """`object_width` at the pick. Each bar lies along x: its middle y, its width, its height."""
+    """`object_width` at the pick. Each bar, along x, is (y of its middle, width, height)."""
     y = GRID.to_world(np.stack(np.indices(GRID.shape), -1))[..., 1]
     height = np.zeros(GRID.shape, np.float32)
     for middle, across, tall in bars:
@@ -25,7 +25,7 @@ def test_the_width_is_that_of_the_object_and_at_most_two_pixels_more():
     # If the pick is off the middle, the width is twice the distance to the farther side.
     aside = width((0.105, 0.025, 0.02))
     assert 0.035 <= aside <= 0.035 + 2.1 * GRID.resolution
-    # The jaws close along the hand's y axis, here along the bar, which has no end in sight.
+    # At this yaw the jaws close along the bar, whose ends are outside the image.
     assert width((0.1, 0.025, 0.02), pick=PlanarPose(0.5, 0.1, math.pi / 2)) == math.inf
 
 

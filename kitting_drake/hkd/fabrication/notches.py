@@ -25,8 +25,8 @@ If the kit's own walls are thinner, their thickness is the limit instead.
 _SLIDES = tuple(sign * step for step in np.arange(0.0, 0.041, 0.004) for sign in (1, -1))
 """The distances from the grasp, along the tool, at which a notch is tried, in metres."""
 _SHARES = (0.85, 1.15)
-"""The least and largest area of the part of a notch outside its cavity, as multiples of the area of
-a half disc."""
+"""A notch counts as half round if its area outside the cavity, divided by the area of a half disc,
+is in this range."""
 _FINS = 1.6
 """The limit for thin fins between a notch and its cavity.
 

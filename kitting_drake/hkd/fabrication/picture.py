@@ -21,7 +21,8 @@ _SHADOW = (0.20, 0.08, 0.0)
 _LIGHT = np.array([-0.45, 0.55, 0.70]) / np.linalg.norm([-0.45, 0.55, 0.70])
 """The unit vector towards the light, in the kit frame."""
 _ROOMIEST = 0.032
-"""The largest distance from a cavity's wall, in metres, that is tried for the text of its depth."""
+"""The search for the point farthest from a cavity's wall starts at this distance, in metres, from
+the wall."""
 _INCHES = 7.5
 """The width of each of the two views, in inches."""
 

@@ -32,8 +32,8 @@ class Jaws:
     # The depth and the pitch of the serrations.
     tooth_mm: float = 0.9
     pitch_mm: float = 2.2
-    # Two angles of both jaws: the turn where they leave the joint, and the further bend from there
-    # to the tip.
+    # The angle by which both jaws turn where they leave the joint, and the angle by which they bend
+    # from there to the tip.
     turn_deg: float = 0.0
     bend_deg: float = 0.0
 

@@ -37,7 +37,7 @@ Array = NDArray[np.float64]
 _LENGTHS, _SHORT, _LONG = (0.11, 0.23), (0.05, 0.11), (0.23, 0.32)
 """The ranges of the lengths of usual, short and long tools, in metres."""
 _UNUSUAL = 0.12
-"""The share of lengths that are drawn from `_SHORT`; an equal share is drawn from `_LONG`."""
+"""The probability that a length is drawn from `_SHORT`. It is the same for `_LONG`."""
 _HIGHEST = 0.046
 """The largest height that fits into a kit's block, in metres."""
 _COMPOSED, _PARTS = 0.2, 0.3

@@ -25,7 +25,7 @@ BIN = 0.0005
 
 # The distance by which the upper fingers are set back from the pads.
 _FINGER_RECESS = 0.003
-# The largest inward lean, in radians, of a face that does not slip out of the pads.
+# A face that leans inward by more than this, in radians, slips out of the pads.
 _STEEPEST = np.radians(28.0)
 # The least share of the pads' length along which both pads must touch the tool, except at a corner.
 _LEAST_CONTACT = 0.15

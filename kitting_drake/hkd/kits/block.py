@@ -117,7 +117,7 @@ class Cavity:
 
         Args:
             surface: the surface to add to.
-            longest: the largest length of an outline's edge, in metres.
+            longest: edges of the outlines that are longer than this, in metres, are subdivided.
 
         Returns:
             The indices of the first vertex of the floor's ring and of the rim's ring.

@@ -18,11 +18,12 @@ from kitting_drake.hkd.tools.collision import furthest
 from kitting_drake.hkd.tools.tool import footprint
 
 MOST_SURFACE_DISTANCE_MM = 0.5
-"""The largest mean distance between a symmetric tool and its rotated copy, in mm."""
+"""A tool counts as symmetric only if its mean distance from its rotated copy is less than this, in
+mm."""
 
 MOST_OUTLINE_DEVIATION_MM = 2.0
-"""The largest distance between the outlines of a symmetric tool and its rotated copy, in mm. It is
-the default clearance of a cavity."""
+"""A tool counts as symmetric only if the largest distance between its outline and that of its
+rotated copy is less than this, in mm. The limit equals the default clearance of a cavity."""
 
 ORDERS = (24, 12, 10, 9, 8, 7, 6, 5, 4, 3, 2)
 """The orders to try, largest first. The largest stands for round tools."""

@@ -11,7 +11,7 @@ Array = NDArray[np.float64]
 
 _SMALL_SIDE = 900
 _LEAST_SHARE = 0.04
-"""The least share of the photo's area that a sheet covers."""
+"""A sheet must cover at least this share of the photo's area."""
 _SAMPLES = 400
 _LEAST_SUPPORT = 0.4
 """At least this share of each edge must be visible."""
@@ -22,7 +22,7 @@ They are shares of the photo's longer side. Each row is one attempt, in which it
 one after the other. The second row begins with a larger distance, for an edge that a tool hides.
 """
 _CLOSE_PX = 2.5
-"""The distance in pixels up to which a point counts as on a line."""
+"""A point that is closer than this to a line, in pixels, counts as on the line."""
 _SAME_QUAD = 0.02
 """Quadrilaterals count as one if their corners differ by less than this share of `_SMALL_SIDE`."""
 

@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 SHEETS = {"a4": (297.0, 210.0), "letter": (279.4, 215.9)}
 """The sides of sheets of paper in mm, the longer side first."""
 _ASPECT_ERROR = 0.025
-"""The largest `_aspect_error` at which the format of a sheet is recognised."""
+"""A quadrilateral may be an A4 or Letter sheet if its `_aspect_error` is less than this."""
 _GIVEN_ASPECT_ERROR = 0.06
 """The largest accepted `_aspect_error` of a sheet whose size the user gives."""
 _FOCALS_35MM = (22.0, 24.0, 26.0, 28.0, 31.0)

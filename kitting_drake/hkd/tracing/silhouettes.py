@@ -151,7 +151,7 @@ def _blur_mm(cv2: Any, soft: Array, mask: Array, ppm: float) -> float:
 
 
 _BAND_MM = 0.7
-"""The largest distance of the true outline from the edge of the mask, in mm."""
+"""The true outline is assumed to be within this distance of the edge of the mask, in mm."""
 _SKIP_MM = 0.35
 """The least distance from the edge of the mask at which colours are sampled, in mm."""
 _NEAR_MM = 0.8

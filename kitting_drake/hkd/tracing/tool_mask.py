@@ -13,7 +13,7 @@ _DARKER, _BRIGHTER, _COLOURED = 0.22, 0.12, 0.11
 """How much darker, brighter, or different in colour a pixel must be to count as unlike the ground,
 in logarithms of light."""
 _NO_SHADOW = 1.3
-"""The largest darkening by a shadow, in logarithms of light."""
+"""A pixel darker than the ground by more than this, in logarithms of light, is not in shadow."""
 _BALL_MM = 0.9
 """The radius of the disc that `_reached` rolls over the ground, in mm."""
 _ROUGH = 0.022
@@ -46,7 +46,7 @@ _BLENDED_MM, _SHADED = 1.2, 0.06
 """A tool blends into a shadow where the brightness step is wider than `_BLENDED_MM` and the shadow
 is darker than `_SHADED`, in logarithms of light."""
 _NEUTRAL = 0.05
-"""The largest difference in colour between shaded and lit ground, in logarithms of light."""
+"""Ground in shadow differs in colour from lit ground by less than this, in logarithms of light."""
 _LARGEST_HOLE_MM2 = 500.0
 """A hole of at least this area, in mm^2, does not count as ground in shadow. A strip may have any
 area."""

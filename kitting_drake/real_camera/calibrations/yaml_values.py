@@ -1,4 +1,4 @@
-"""Reads YAML and JSON files that OpenCV, ROS or people wrote, and numbers from their values."""
+"""Reads YAML and JSON files that OpenCV, ROS or people wrote, and converts values to numbers."""
 
 from __future__ import annotations
 

@@ -43,7 +43,7 @@ class _Outline(NamedTuple):
 class Convolutions:
     """The convolutions that a function computes, including those of its backward passes.
 
-    Depthwise convolutions are left out, because they are filters rather than layers.
+    Depthwise convolutions are left out: they only blur features for pooling.
     """
 
     calls: Counter[tuple[Any, tuple[Any, ...]]]

@@ -59,8 +59,8 @@ def measure_pick_angles(setup: SpeedSetup, preset: str) -> list[dict[str, Any]]:
         skipped = {n: setup.why_not(outlined, count) for n, count in operations.items()}
         timings: dict[int, Timing] = {}
         if not all(skipped.values()):
-            # Use untrained networks, which are as fast as trained ones. Unlike in an evaluation, do
-            # not load them from a file, which could take gigabytes.
+            # Use untrained networks, which are as fast as trained ones. Loading networks from a
+            # file, as an evaluation does, could take gigabytes.
             networks = _without_others(make_networks(config, PlainConv2d), names).to(setup.device)
             networks.freeze(preferred_type())
             timings = setup.time_each(

@@ -55,9 +55,9 @@ def differences(results: Mapping[str, Result]) -> list[str]:
 def _means(results: Mapping[str, Result]) -> list[list[str]]:
     """Returns rows with mean differences between SO(2) and the Equivariant Transporter.
 
-    For each task and number of demonstrations in figure 6, one row has the mean over N, if all of
-    these cells exist. For each task, another row has the mean over the trainings that both methods
-    have, if there are several.
+    For each task and number of demonstrations in figure 6, a row has the mean over N, if both
+    methods have results at every N. For each task, another row has the mean over the training seeds
+    for which both methods have results, if there are several.
     """
     rows = []
     ours, theirs = LEARNED[:2]

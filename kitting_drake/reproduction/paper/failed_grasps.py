@@ -25,8 +25,8 @@ _MOST_ACTIONS = {
     "!PalletizingBoxes": 30,
     "!StackBlockPyramid": 12,
 }
-"""The largest number of actions of an episode, by task, for runs whose summaries do not state how
-many actions they had. On any other task it is one action per object."""
+"""The largest number of actions of an episode, by task, for runs whose summaries do not count their
+actions. On any other task, an episode has at most one action per object."""
 
 
 @dataclass(frozen=True)

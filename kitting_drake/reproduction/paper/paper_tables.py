@@ -36,10 +36,11 @@ MATCHED = "matched"
 """The preset that reduces the baselines' networks by the same factor as the SO(2) networks; see
 `paper.parameter_table`."""
 ROTATIONS = 18
-"""In the cells of `_every_chance`, a training step of the Transporter uses this many of the 36
-rotations."""
+"""The number of rotations (out of 36) in a training step of the Transporter, in the cells with the
+label `EVERY_CHANCE`."""
 EVERY_CHANCE = "every_chance"
-"""The label of the cells of `_every_chance`."""
+"""The label of cells in which the baselines have larger networks and the Transporter is trained
+longer."""
 BEYOND_OF_TABLE_1 = ("stack_block_pyramid",)
 """The tasks of table I that are run both as published and with our extensions. In our runs as
 published, the SO(2) method scores lower on them than in the paper, after ten or a hundred

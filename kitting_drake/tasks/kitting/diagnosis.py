@@ -71,7 +71,7 @@ def find_cause(
         # Compare the grasp point as well: half a turn about the grasp displaces the tool's
         # middle, but not the grasp.
         if min(_gap(X_WB, X_WGoal, middle), _gap(X_WB, X_WGoal, grasp_point)) < _NEAR:
-            # The error is modulo the tool's symmetry: after half a turn, a symmetric tool has none.
+            # `angle_error` is modulo the tool's symmetry: half a turn of a symmetric tool gives 0.
             rotation = abs(placement.angle_error)
             if rotation > math.pi - _ALIGNED or _tilt(X_WB) > _TILTED:
                 return REVERSED

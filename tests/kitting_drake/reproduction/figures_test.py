@@ -47,8 +47,8 @@ def readme() -> str:
 def rows(page: str, *sections: str) -> list[list[str]]:
     """The rows of all tables of a page, each as a list of its cells.
 
-    If `sections` has headings, only the section under the last one counts. Each heading is searched
-    after the one before.
+    `sections` are headings, in their order on the page. If there are any, only the tables under the
+    last one count.
     """
     for section in sections:
         page = page.split(section, 1)[1]

@@ -60,5 +60,5 @@ def sag(payload: float) -> float:
 def test_what_was_weighed_causes_no_sag():
     assert sag(0.0) > 0.002
     assert abs(sag(-WEIGHT)) < 0.0003
-    # The compensated weight may be wrong by a tenth.
+    # Even if the compensated weight is wrong by a tenth, the hand hardly sinks.
     assert abs(sag(-0.9 * WEIGHT)) < 0.001

@@ -41,7 +41,7 @@ _ROOMY = 4.0
 _STEEPEST = 4
 """The largest sideways step of a cut for each step forward, in cells."""
 _UPRIGHT_ENDS = 6.0
-"""A cut is perpendicular to the block's side over this length from each of its ends, in mm."""
+"""The length at each end of a cut, in mm, that is perpendicular to the block's side."""
 _REPAIRS = 8
 """The largest number of attempts to find cuts that leave no thin wall."""
 _BARRED = 400.0

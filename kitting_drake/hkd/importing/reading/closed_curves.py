@@ -44,7 +44,7 @@ _HOLE, _TOOL = 0.25, 0.4
 """Shares of a rectangle's length. Within the rectangle, a curve shorter than `_HOLE` is a hole, and
 a curve longer than `_TOOL` may be a tool."""
 _ROUND = 0.02
-"""A curve is round if its extents and area differ from a circle's by less than this fraction."""
+"""A curve is a circle if its extents and area differ from a circle's by less than this fraction."""
 
 Points = NDArray[np.float64]
 
@@ -146,7 +146,7 @@ def _as_frame(
         frame: as in `enclosed`.
 
     Raises:
-        FrameError: the largest curve may be a frame or the tool.
+        FrameError: it is not clear whether the largest curve is a frame or the tool.
     """
     box, inside, *others = loops
     sides = box.size

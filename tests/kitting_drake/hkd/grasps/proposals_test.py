@@ -34,7 +34,7 @@ def test_a_bar_is_gripped_across_at_its_centre_of_mass():
 
 
 def test_the_pads_stay_above_a_broad_foot_and_the_table():
-    """A bar on a broad foot: only shallow pads pass above the foot."""
+    """A bar on a broad foot: the pads clear the foot only if the grasp is shallow."""
     solid = bar(160, 70, 8) + bar(160, 18, 24)
     assert propose_grasps(triangles(solid), np.zeros(3))[0].width == pytest.approx(0.018, abs=1e-6)
     deep = PickPlaceParameters(grasp_depth=0.020)

@@ -138,7 +138,7 @@ def test_of_equally_good_rotations_the_one_with_room_is_taken(heading: float, co
 
 
 def test_a_worse_rotation_is_not_taken():
-    """An L fits in one rotation only, which is kept even where neighbours leave no room."""
+    """An L fits in one rotation only. The policy keeps it even if the jaws have no room to open."""
 
     class Corner(Cubes):
         def encode_scene(self, image) -> torch.Tensor:
