@@ -98,7 +98,7 @@ def _stops(
     scene: Scene,
     parameters: PickPlaceParameters,
 ) -> Iterable[HandStop]:
-    """Yields the place at which the hand goes down, for each grasp of an object at a pose."""
+    """Yields, for each grasp of an object at a pose, where the hand goes down."""
     highest = _highest(scene)
     bottom = float(X_WB.translation()[2])
     for grasp in item.grasps:

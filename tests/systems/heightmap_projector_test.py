@@ -96,7 +96,7 @@ CORNERS = np.array([(-0.5, -0.5), (-0.5, 0.5), (0.5, -0.5), (0.5, 0.5)])
 def _cells_against_box(X_WBox):
     """Two masks: pixels that lie inside the box's footprint, and pixels that do not touch it.
 
-    The latter are found by the separating axis theorem, with a margin of 0.3 mm.
+    Pixels that do not touch it are found by the separating axis theorem, with a margin of 0.3 mm.
     """
     offset_W = GRID.to_world(PIXELS) - X_WBox.translation()[:2]
     R = X_WBox.rotation().matrix()[:2, :2]

@@ -13,7 +13,7 @@ from kitting_drake.hkd.kits.block import ARC_SEGMENTS, Cavity
 from kitting_drake.hkd.kits.kit import Kit
 
 RADII = (0.012, 0.010, 0.008)
-"""The radii of notches that are tried in this order, in metres."""
+"""The radii of notches, in metres, in the order in which they are tried."""
 DEEPEST = 0.020
 """The largest depth of a notch in metres: the reach of a finger."""
 

@@ -251,7 +251,8 @@ def _plate_hulls(
     bevel: float,
     cells: Sequence[CrossSection],
 ) -> list[np.ndarray]:
-    """Makes prisms over the cells or triangles of a plate's profile; the lower edge is bevelled."""
+    """Makes prisms over the cells of a plate's profile, or over its triangles if it has no cells.
+    The prisms' lower edges are bevelled."""
     coarse = profile.simplify(0.08)
     loops = coarse.to_polygons()
     points = np.vstack(loops)

@@ -88,8 +88,8 @@ class TracedTool:
 
     @property
     def size_mm(self) -> tuple[float, float]:
-        """The length and width of the smallest rectangle around the outline, searched in steps of 1
-        degree."""
+        """The length and width of the smallest rectangle around the outline. Rotations in steps of
+        1 degree are compared."""
         sizes = []
         for angle in range(180):
             x_low, y_low, x_high, y_high = self.outline.rotate(angle).bounds()

@@ -35,8 +35,8 @@ def measure_folding(setup: SpeedSetup) -> dict[str, Any]:
         - `convolution_share`: for the variants of this package, the time that plain torch needs for
           convolutions of the same shapes and type, as a share of the time of a training step and of
           a decision;
-        - `alpha_difference`: the standard deviation of the difference between alpha's output and
-          that of plain escnn, relative to the standard deviation of the latter;
+        - `alpha_difference`: the standard deviation of alpha's output minus that of plain escnn,
+          relative to the standard deviation of plain escnn's output;
         - `alpha_operations`: the number of operations of one inference of alpha.
     """
     ways = _ways(setup)

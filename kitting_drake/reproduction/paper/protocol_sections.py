@@ -49,7 +49,7 @@ _VARIANTS = {
     "without labels of later picks": "_minus_all_targets",
     "without curvature and reflection": "_minus_curvature",
 }
-"""The labels of the rows of a table, each with the ending of the names of the row's cells."""
+"""For each row's label, the ending of the names of its cells."""
 
 _TOLD = ("trained_orientations", "steps", "learning_rate", "training_seed", "compute_type")
 """The details of a policy that are columns of the table "Every cell"."""
