@@ -28,7 +28,7 @@ _NOT_MEASURED = (
         "not given",
         "15 mm thick, but cubes are 10 mm apart: jaws that open along a row push the next cube",
     ),
-    ("release, in cells marked `e`", "the gap between the jaws grows by 5 mm", "it grows by 12 mm"),
+    ("release, in cells marked `e`", "the jaws open by 5 mm", "the jaws open by 12 mm"),
     ("open jaws, place red in green, cells marked `e`", "50 mm apart", "80 mm apart"),
     (
         "demonstrated picks, in cells marked `e`",
@@ -80,7 +80,7 @@ def departures(results: Mapping[str, Result]) -> str:
             "1000 to 3000; the learning rate rises, then falls",
             _compared(
                 results,
-                "our method on the pyramid, with three times the steps",
+                "change with three times the steps (our method, pyramid)",
                 {
                     f"N = {n}": (f"{name}_3_times_the_steps", name)
                     for n in (180, 36)
@@ -94,7 +94,7 @@ def departures(results: Mapping[str, Result]) -> str:
             "trained once, at N = 180",
             _compared(
                 results,
-                "if trained at N = 36",
+                "change if trained at N = 36",
                 {
                     label: (f"{name}_trained_at_36", name)
                     for label, name in (
@@ -135,7 +135,7 @@ def _compared(
         if one in results and other in results:
             points = paired_difference(results[one].summary, results[other].summary, OWN)
             if points is not None:
-                found.append(f"{label}: {points_text(points)}")
+                found.append(f"{label}: {points_text(points)} points")
     return f"{what}:<br>{'<br>'.join(found)}" if found else "not yet measured"
 
 
@@ -163,4 +163,4 @@ def _memory(results: Mapping[str, Result]) -> str:
             total = sum(found[1:], found[0])
             least, most = (100 * count / total.actions for count in (total.at_least, total.at_most))
             parts.append(f"{label}: {least:.1f} to {most:.1f} %")
-    return f"actions that may differ:<br>{'<br>'.join(parts)}" if parts else "not yet measured"
+    return f"actions possibly changed:<br>{'<br>'.join(parts)}" if parts else "not yet measured"
