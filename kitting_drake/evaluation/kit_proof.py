@@ -136,7 +136,8 @@ class KitProof:
 
     @property
     def may_be_tight(self) -> bool:
-        """Whether the kit does not fit, but would fit without the failures of `_TIGHT`."""
+        """Whether the kit does not fit, but would if the failures with a cause in `_TIGHT` were
+        successes."""
         stuck = sum(tool.causes[cause] for tool in self.tools.values() for cause in _TIGHT)
         return not self.fits and self.kitted + stuck >= GOOD * self.tried
 

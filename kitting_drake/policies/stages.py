@@ -25,9 +25,9 @@ from systems.signals import wrap_to_pi
 
 _AS_GOOD = 2.0
 """A rotation counts as equally good if its score is at most this many nats below the best score,
-and its place is within `_SAME_PLACE` pixels of the best rotation's place."""
+and its place is within `_SAME_PLACE` of the best rotation's place."""
 _SAME_PLACE = 4.0
-"""The limit, in pixels, for the distance between these two places."""
+"""The largest distance, in pixels, between two places that count as the same."""
 _TRIES = 4
 """The policy stops after this many proposals whose pick or place is not seen well enough."""
 _ANOTHER = 0.010

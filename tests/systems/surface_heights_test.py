@@ -86,7 +86,7 @@ def test_noise_and_calibration_errors_are_corrected(noise: float, off: float):
 
 @pytest.mark.parametrize("noise", [0.0, 0.0015])
 def test_unseen_pixels_do_not_count_as_the_table(noise: float):
-    """Most pixels at the pick are unseen, and so is the shadow beside the tool on a block."""
+    """A tool lies on a block. Its shadow, and most pixels where it is picked, are unseen."""
     grid = PixelGrid()
     row, col = np.rint(grid.to_pixel((PLACE.x, PLACE.y))).astype(int)
     height = noise * np.random.default_rng(0).standard_normal(grid.shape)

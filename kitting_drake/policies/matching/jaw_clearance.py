@@ -237,8 +237,9 @@ def _straightness(
 
     Returns:
         (n,): the share of the lines that touch both pads.
-        (n,): the sum of the two faces' absolute slopes along the pads.
-        (n,): the absolute value of the sum of these two slopes.
+        (n,): how far the faces are from parallel to the pads: |left slope| + |right slope|.
+        (n,): how far both slope in the same direction: |left slope + right slope|. It is 0 for a
+            wedge that lies symmetrically between the pads.
     """
     low = np.where(inside.any(axis=2), s[inside.argmax(axis=2)], np.nan)
     high = np.where(inside.any(axis=2), s[len(s) - 1 - inside[:, :, ::-1].argmax(axis=2)], np.nan)

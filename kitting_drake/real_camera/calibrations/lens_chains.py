@@ -51,8 +51,8 @@ def with_chained_poses(entries: dict[str, Any], path: Path) -> dict[str, Any]:
             continue
         if len(others) > 1:
             raise UserError(
-                f"{path}: camera {name} has no pose, but several cameras of its camchain have one "
-                f"({', '.join(others)}): keep the pose of only one of them"
+                f"{path}: the pose of camera {name} could follow from a pose of its camchain, but "
+                f"several cameras have one ({', '.join(others)}): keep only one of their poses"
             )
         ((other, entry),) = others.items()
         X_BO = read_pose(entry, f"{path}: camera {other}", path.parent)

@@ -59,11 +59,11 @@ not part of the table."""
 _TALL = 1.2
 """Points that are higher above the table than this, in metres, are ignored."""
 _CLOSED = 0.035
-"""Gaps in the table are closed if they are at most twice this wide, in metres. They come from
+"""Half of the largest width, in metres, of a gap in the table that is closed. Such gaps come from
 objects and shadows."""
 _KIT = 0.03
-"""An object at the table's edge counts as part of the table if it is at least twice this wide, in
-metres. Narrower things, such as profiles along the edge, do not count."""
+"""Half of the least width, in metres, of an object at the table's edge that counts as part of the
+table. Profiles along the edge are narrower and do not count."""
 _LEAST_TALL = 0.02
 """Tall things narrower than this, in metres, count as noise."""
 _AROUND = 0.02

@@ -209,7 +209,7 @@ def reference(training: Training) -> Training:
 
 
 def rates_key(chosen_by: Training) -> str:
-    """Returns the key in `Rates` of a training that chooses a learning rate (see `reference`)."""
+    """Returns the key in `Rates` of a training that was returned by `reference`."""
     return f"{chosen_by.task}_{chosen_by.method}"
 
 

@@ -31,8 +31,8 @@ _ROWS = {
 """The rows of table I (method and N), with markers and with colours that the colour-blind can
 distinguish."""
 _ROW_STEP = 0.19
-"""The distance along x between the markers of neighbouring `_ROWS` at the same number of
-demonstrations. Successive numbers of demonstrations are 1 apart."""
+"""At each number of demonstrations, the markers of `_ROWS` stand side by side, this far apart along
+x. Successive numbers of demonstrations are 1 apart."""
 _STYLE = {
     "font.size": 13,
     "axes.edgecolor": "0.5",

@@ -32,7 +32,7 @@ _PALLET_HEIGHT = 0.04
 _P_WSOURCE = (0.5, -0.25)
 """(x, y) in the world at which the boxes appear, in metres."""
 _DROP = 0.08
-"""A box appears with its bottom at this height, in metres. The first box lies on the table."""
+"""All boxes but the first appear in the air. This is the height of their bottom, in metres."""
 _SOURCE_AREA = ((-5.0, -0.5), (5.0, 0.0))
 """The next box appears when no box is in this area, given by its lower and upper (x, y) corners, in
 metres."""

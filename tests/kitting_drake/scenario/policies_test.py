@@ -36,7 +36,7 @@ GRID = PixelGrid(rows=33, cols=49)
 
 @pytest.fixture(scope="module")
 def site() -> PolicySite:
-    """A policy's site, without objects in a plant."""
+    """A site whose list of placed objects is empty, because there is no plant to place them in."""
     scene = ArrangedKitting().make_scene(grid=PixelGrid(), seed=0, base=Path())
     return PolicySite(scene=scene, objects=(), grid=GRID, base=Path())
 

@@ -59,8 +59,8 @@ class ExpandedConv2d(nn.Module):
             out_fibre: the fibre of each output field.
             size: the side of the kernel, odd, in pixels.
             padding: zero padding, in pixels; by default the image keeps its size.
-            bias: whether each output field has a bias on its invariant part. The output fibre must
-                be scalar or regular, or be stored as samples.
+            bias: whether to add a trainable bias to the invariant part of each output field. With
+                a bias, the output fibre must be scalar or regular, or be stored as samples.
             gain: a factor of the initial weights' standard deviation.
 
         Raises:
