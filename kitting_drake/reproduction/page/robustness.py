@@ -25,7 +25,7 @@ _COLUMNS = {
     "shape_matching": "shape matching",
 }
 _COMPARED = (
-    "generalist minus unperturbed, common seeds",
+    "generalist: perturbed minus unperturbed, common seeds",
     "generalist minus shape matching, common seeds",
 )
 """The paired differences, in percentage points, on the seeds that both runs have."""

@@ -80,7 +80,7 @@ def departures(results: Mapping[str, Result]) -> str:
             "1000 to 3000; the learning rate rises, then falls",
             _compared(
                 results,
-                "change with three times the steps (our method, pyramid)",
+                "success of our method on the pyramid, with three times the steps",
                 {
                     f"N = {n}": (f"{name}_3_times_the_steps", name)
                     for n in (180, 36)
@@ -94,7 +94,7 @@ def departures(results: Mapping[str, Result]) -> str:
             "trained once, at N = 180",
             _compared(
                 results,
-                "change if trained at N = 36",
+                "success if trained at N = 36",
                 {
                     label: (f"{name}_trained_at_36", name)
                     for label, name in (

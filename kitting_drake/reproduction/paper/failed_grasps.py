@@ -114,7 +114,7 @@ def failed_grasps(results: Sequence[Result]) -> list[str]:
             share = f"{100 * total.at_most / total.actions:.0f} %"
             rows.append([task, METHODS[method], str(len(cells)), str(unchanged), total.text, share])
     headings = ["task", "method", "cells", "cells without failed grasps"]
-    headings += ["actions after a failed grasp, of all actions", "largest possible share"]
+    headings += ["actions after a failed grasp, of all actions", "their largest possible share"]
     return [
         "### The memory of failed grasps\n",
         prose("failed_grasps"),

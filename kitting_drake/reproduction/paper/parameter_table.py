@@ -21,8 +21,9 @@ _TEXT = f"""\
 #### Parameters of every network
 
 The table has the trainable parameters at N = {ORIENTATIONS}. The only picking network of the
-Transporter, f_pick, is under alpha. The *ratio* compares all networks with those of the original
-method. For both baselines, our preset `paper` stands for the original.
+Transporter, f_pick, is under alpha. The *ratio* is the number of parameters of all networks,
+divided by that of the original method. For both baselines, our preset `paper` stands for the
+original.
 
 The presets `small` and `matched` differ in the baselines only. In both, our networks are 25 times
 smaller than the paper's. In `matched`, the Transporter is also 25 times smaller than its original,
