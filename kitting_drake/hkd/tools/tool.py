@@ -25,6 +25,10 @@ CATEGORIES = ("hammer", "pliers", "wrench", "screwdriver")
 SHORTEST_MM, LONGEST_MM = 15.0, 350.0
 """The shortest and the longest length of a user's tool, in mm."""
 
+_ROUND = 0.98
+"""An outline is a circle if its area is more than this share of that of the circle around it. A
+regular polygon of 20 sides has 0.984."""
+
 # libyaml reads records ten times as fast as PyYAML's own loader.
 RecordLoader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
@@ -103,6 +107,17 @@ class Tool:
     def footprint(self) -> CrossSection:
         """The outline seen from above, in T, in metres."""
         return footprint(self.triangles)
+
+    @cached_property
+    def is_round(self) -> bool:
+        """Whether the outline is a circle, so that a cavity takes the tool at any heading. Holes
+        do not matter."""
+        outlines = (CrossSection([part]) for part in self.footprint.to_polygons())
+        outer = max(outlines, key=CrossSection.area)
+        points = np.concatenate(outer.to_polygons())
+        middle = (points.min(axis=0) + points.max(axis=0)) / 2
+        circle = math.pi * float(np.square(points - middle).sum(axis=1).max())
+        return bool(outer.area() > _ROUND * circle)
 
     @property
     def axis(self) -> tuple[float, float] | None:

@@ -114,6 +114,7 @@ def _goal(
         objects=alike,
         poses=(X_WKit @ X_KGoal,),
         reward=reward,
+        any_heading=posed.kit.tools[slot].is_round,
         rim_height=rim,
         highest=highest,
         fixture=number,

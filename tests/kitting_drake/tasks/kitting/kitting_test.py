@@ -280,3 +280,13 @@ def test_an_error_names_the_field_of_a_kit_without_room():
     small = KitParameters(fixed_size=True, length=0.1, width=0.1)
     with pytest.raises(UserError, match=r"^task\.kit: "):
         draw(0, Kitting(tools=["claw_hammer"], kit=small))
+
+
+def test_a_round_cavity_takes_a_tool_at_any_heading():
+    # The socket has a hexagonal hole, so its own symmetry is of order 6.
+    scene = draw(0, Kitting(tools=["socket_22x26", "bracket_60x36x12"]))
+    turn = RigidTransform(RollPitchYaw(0, 0, np.radians(25)), [0, 0, 0])
+    seated = [goal.poses[0] @ turn for goal in scene.goals]
+    found = dict(zip(names(scene), placements(scene, seated), strict=True))
+    assert found["socket_22x26"].strict_success
+    assert not found["bracket_60x36x12"].strict_success
