@@ -25,8 +25,8 @@ from systems.signals import PixelGrid
 _YAWS = np.deg2rad([0.0, 45.0, 90.0, 135.0])
 """Yaws at which the waiting hand is checked, relative to the yaw of the home pose, in rad."""
 _PLACES = 9
-"""Number of waiting positions to check along the workspace's y axis, because the hand may wait at
-any y."""
+"""The hand may wait at any y of the workspace. This many values of y are checked, besides that of
+the home pose."""
 _GRID = 100
 """Number of points to check along each side of the workspace."""
 _BORDER = 0.015

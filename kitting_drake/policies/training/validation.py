@@ -73,11 +73,12 @@ def prediction_errors(
 
 
 def choose_stop_threshold(present: ArrayLike, absent: ArrayLike) -> float | None:
-    """Chooses the log-odds below which a policy should stop.
+    """Chooses a threshold for the log-odds that there is something to pick. Below it, a policy
+    should stop.
 
     Args:
-        present: the log-odds of scenes with something to pick.
-        absent: the log-odds of final observations.
+        present: the log-odds in scenes with something to pick.
+        absent: the log-odds in final observations.
 
     Returns:
         The threshold with the fewest wrong decisions; None if `present` or `absent` is empty. Of
@@ -115,8 +116,8 @@ def validate(
         If there are final observations, also:
 
         - `stop_threshold`: the threshold of `choose_stop_threshold`;
-        - `stop_margin`: the least log-odds of a scene minus the largest of a final observation, in
-          nats;
+        - `stop_margin`: the log-odds that there is something to pick: their least value in
+          `scenes` minus their largest value in `finals`, in nats;
         - `false_stops` and `missed_stops`: the numbers of wrong decisions to stop and to go on.
     """
     errors, present = [], []
@@ -161,8 +162,8 @@ def _stop_report(
     """Returns the part of `validate`'s report about stopping.
 
     Args:
-        present: the log-odds of scenes with something to pick.
-        absent: the log-odds of final observations.
+        present: the log-odds that there is something to pick, in scenes where there is.
+        absent: the same log-odds in final observations.
         displacements: the displacements of the scenes, in mm.
     """
     threshold = choose_stop_threshold(present, absent)

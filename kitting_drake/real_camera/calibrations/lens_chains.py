@@ -51,8 +51,8 @@ def with_chained_poses(entries: dict[str, Any], path: Path) -> dict[str, Any]:
             continue
         if len(others) > 1:
             raise UserError(
-                f"{path}: the pose of camera {name} could follow from a pose of its camchain, but "
-                f"several cameras have one ({', '.join(others)}): keep only one of their poses"
+                f"{path}: camera {name} has no pose, but more than one other camera of its "
+                f"camchain has one ({', '.join(others)}): keep one pose; the others follow from it"
             )
         ((other, entry),) = others.items()
         X_BO = read_pose(entry, f"{path}: camera {other}", path.parent)

@@ -115,8 +115,8 @@ def kalibr_stream(cameras: dict[str, dict[str, Any]], where: str, stream: str) -
     found = named or list(cameras)
     if len(found) != 1:
         raise UserError(
-            f"{where} has the cameras {', '.join(cameras)}: give stream: {next(iter(cameras))}, or "
-            "another"
+            f"{where} has the cameras {', '.join(cameras)}: choose one, for example with "
+            f"`stream: {next(iter(cameras))}`"
         )
     return found[0]
 

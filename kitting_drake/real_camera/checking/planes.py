@@ -20,8 +20,8 @@ _TRIALS = 200
 _TRIED = 2000
 """The number of points on which a trial plane is scored."""
 _THIN = 1e-3
-"""Planes are tried only through three points whose triangle, as seen from above, has more than half
-this area, in square metres."""
+"""A plane is tried through three points. Seen from above, twice the area of their triangle must
+exceed this, in square metres."""
 _BAND = 0.004
 """The largest distance of inliers from a trial plane, in metres."""
 _REFITS = 4

@@ -49,7 +49,7 @@ _ABOVE_FLOOR = 0.25
 """If a level plane is more than this above the largest plane, in metres, it is the table, and the
 largest plane is the floor."""
 _TABLE_SHARE = 0.1
-"""Such a table must have more than this share of the number of points on the floor."""
+"""The number of points on such a table, divided by that on the floor, must exceed this."""
 _BAND = 0.006
 """Points within this distance of the plane, in metres, belong to it. Three times the noise is used
 if that is larger."""

@@ -83,8 +83,8 @@ _LIMITED_HAND = (
     "touch_speed",
     "slow_margin",
 )
-"""Fields of the planner that are missing in the summaries of runs with `_UNLIMITED_HAND`. Such runs
-count as runs of the present hand; the page of results says how many they are."""
+"""Fields of the planner that older versions, without a limit on contact forces, did not write.
+Their runs are compared as if with the present defaults; the page of results counts them."""
 
 _MOST_SHOWN = 4
 """The largest number of differences of one run that are listed. Further ones are only counted."""

@@ -203,8 +203,8 @@ class Training:
 
 
 def reference(training: Training) -> Training:
-    """Returns the training on which the learning rate of a baseline is chosen. The learning rate of
-    the returned training is not set."""
+    """Returns the training that is run with each of `LEARNING_RATES` to choose the rate of a
+    baseline's training. In the result, `learning_rate` is None."""
     return Training(TASKS[training.task].rates_from, training.method, 36, 100)
 
 

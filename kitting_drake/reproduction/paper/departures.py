@@ -29,7 +29,7 @@ _NOT_MEASURED = (
         "15 mm thick, but cubes are 10 mm apart: jaws that open along a row push the next cube",
     ),
     ("release, in cells marked `e`", "the jaws open by 5 mm", "the jaws open by 12 mm"),
-    ("open jaws, place red in green, cells marked `e`", "50 mm apart", "80 mm apart"),
+    ("jaws before a pick, place red in green, cells marked `e`", "50 mm apart", "80 mm apart"),
     (
         "demonstrated picks, in cells marked `e`",
         "off the object's middle, along one axis",

@@ -120,10 +120,9 @@ def _scale(root: ElementTree.Element, text: bytes, unit_mm: float | None) -> tup
     if writer is not None:
         if paper and abs(25.4 / dpi / paper_mm - 1) > 1e-6:
             raise UserError(
-                f"the page's size is ambiguous: with the pixels of {writer} (1/{dpi} inch) its "
-                f"longer side is {25.4 / dpi * sides[1]:.0f} mm, but its numbers are those of "
-                f"{paper}, whose longer side is {paper_mm * sides[1]:.0f} mm; give --length_mm, or "
-                "set width and height in mm"
+                f"the page's longer side may be {25.4 / dpi * sides[1]:.0f} mm, in the pixels of "
+                f"{writer} (1/{dpi} inch), or {paper_mm * sides[1]:.0f} mm, if the page is "
+                f"{paper}: give --length_mm, or set width and height in mm"
             )
         return 25.4 / dpi, f"by pixels of 1/{dpi} inch, as {writer} writes them"
     if paper:

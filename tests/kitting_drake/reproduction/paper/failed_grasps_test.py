@@ -37,8 +37,8 @@ def test_placed_objects_took_their_own_actions():
     found = changeable(summary([[2] * 6, [2, 2, 2, 2, 2, 0]], 2, actions=14, **pyramid))
     assert found.text == "0 to 12 of 14"
     found = changeable(summary([[2] * 6, [2, 2, 2, 2, 2, 0]], 1, actions=14, **pyramid))
-    # The episode without a failed grasp took at least five actions, one for each placed cube. So
-    # the other episode took at most nine, of which eight can follow its failed grasp.
+    # One episode has the failed grasp. The other one placed at least five cubes, in at least five
+    # actions. This leaves at most nine for the first episode; eight can follow the failed grasp.
     assert found.text == "0 to 8 of 14"
     assert changeable(summary([[2] * 6], 1, **pyramid)).text == "0 to 11 of 12"
 
