@@ -19,7 +19,7 @@ from rich.console import Console
 
 from kitting_drake.common.command_line import run_command
 from kitting_drake.common.files import write_atomically
-from kitting_drake.reproduction.page.harder_scenes import harder_scenes_text
+from kitting_drake.reproduction.page.harder_scenes import harder_scenes_table
 from kitting_drake.reproduction.page.protocol_page import protocol_page
 from kitting_drake.reproduction.page.results_page import results_page
 from kitting_drake.reproduction.page.robustness import robustness_table, with_figures
@@ -68,8 +68,8 @@ def main() -> int:
     _draw(answers, efficiency, output.parent)
     robustness = output.with_name("robustness.md")
     if robustness.exists():
-        figures = robustness_table(others) + harder_scenes_text(others)
-        page = with_figures(robustness.read_text(), figures)
+        page = with_figures(robustness.read_text(), robustness_table(others))
+        page = with_figures(page, harder_scenes_table(others), "harder scenes")
         write_atomically(robustness, page)
     Console(quiet=arguments.quiet).print(
         f"{len(runs)} runs: {output}", highlight=False, markup=False

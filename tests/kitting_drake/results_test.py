@@ -12,6 +12,7 @@ from kitting_drake import results
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import SCENARIOS
 from kitting_drake.evaluation.summary import summarise
+from kitting_drake.reproduction.page.harder_scenes import harder_scenes_table
 from kitting_drake.reproduction.page.protocol_page import protocol_page
 from kitting_drake.reproduction.page.results_page import results_page
 from kitting_drake.reproduction.page.robustness import robustness_table, with_figures
@@ -395,3 +396,5 @@ def test_own_pages_are_up_to_date(own_runs: list[Run]):
     assert protocol == (OWN.parent / "protocol.md").read_text()
     robustness = (OWN.parent / "robustness.md").read_text()
     assert with_figures(robustness, robustness_table(others)) == robustness
+    harder = harder_scenes_table(others)
+    assert with_figures(robustness, harder, "harder scenes") == robustness

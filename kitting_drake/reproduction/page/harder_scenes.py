@@ -45,20 +45,7 @@ _ROWS = (
 )
 
 
-_TEXT = """
-## Harder scenes
-
-Each cell has 25 episodes on seeds that nobody had looked at before. Both policies have
-`recover: true` and the shipped weights, and every task but the last two has at least two tries per
-tool. The oracle knows all poses; its column shows that the scenes can be solved. The column of
-forces has two contact forces of the generalist's actions: 95 % are below the first, and none is
-above the second. The last column counts the generalist's episodes that ended with the right
-[reason](commands.md).
-
-"""
-
-
-def harder_scenes_text(runs: Sequence[Run]) -> str:
+def harder_scenes_table(runs: Sequence[Run]) -> str:
     """Writes the section: the strict success of each policy, and for the generalist also the
     largest forces and the number of right reasons to stop. Without runs the section is empty.
 
@@ -81,9 +68,9 @@ def harder_scenes_text(runs: Sequence[Run]) -> str:
             ]
         )
     if not rows:
-        return ""
+        return "No runs yet.\n"
     headings = ["scene", *_POLICIES.values(), "force, N", "right reasons to stop"]
-    return _TEXT + markdown_table(headings, rows)
+    return markdown_table(headings, rows)
 
 
 def _is_of(run: Run, row: _Row) -> bool:

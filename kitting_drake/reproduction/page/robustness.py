@@ -17,7 +17,6 @@ from kitting_drake.scenario.perturbations import LEVELS, NAMES
 from kitting_drake.scenario.policies import Learned
 
 _UNSEEN = SCENARIOS / "paper/kitting_unseen.yaml"
-_BEGIN, _END = "<!-- figures -->\n", "<!-- end of figures -->\n"
 _UNPERTURBED = "unperturbed"
 _COLUMNS = {
     "so2": "from 100 demonstrations",
@@ -202,17 +201,23 @@ def _strict(run: Run) -> tuple[int, int]:
     return round(run.summary["strict_success_rate"] * objects), objects
 
 
-def with_figures(page: str, figures: str) -> str:
+def with_figures(page: str, figures: str, name: str = "figures") -> str:
     """Returns a page with `figures` as the text between its two marks.
+
+    Args:
+        page: the page, with the marks `<!-- name -->` and `<!-- end of name -->`.
+        figures: the new text.
+        name: the name in the marks.
 
     Raises:
         UserError: the page lacks the marks.
     """
-    head, begin, rest = page.partition(_BEGIN)
-    _, end, tail = rest.partition(_END)
+    start, stop = f"<!-- {name} -->\n", f"<!-- end of {name} -->\n"
+    head, begin, rest = page.partition(start)
+    _, end, tail = rest.partition(stop)
     if not begin or not end:
         raise UserError(
-            f"robustness.md lacks the marks {_BEGIN.strip()} and {_END.strip()}: restore them"
+            f"robustness.md lacks the marks {start.strip()} and {stop.strip()}: restore them"
         )
     return f"{head}{begin}{figures}{end}{tail}"
 

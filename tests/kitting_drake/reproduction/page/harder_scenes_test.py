@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from kitting_drake.reproduction.page.harder_scenes import harder_scenes_text
+from kitting_drake.reproduction.page.harder_scenes import harder_scenes_table
 from kitting_drake.reproduction.page.runs import Run
 
 
@@ -33,7 +33,7 @@ def test_each_run_is_in_its_row():
     unseen = "kitting_unseen:KittingUnseenToolsets"
     shapes = {"task": {"shapes": "folder"}}
     table = rows(
-        harder_scenes_text(
+        harder_scenes_table(
             [
                 run("scenes_heap", "heaps:heap", "generalist", 0.75),
                 run("scenes_heap_matching", "heaps:heap", "shape_matching", 0.5),
@@ -60,5 +60,5 @@ def test_each_run_is_in_its_row():
     assert not any("one across" in label for label in table)
 
 
-def test_without_runs_there_is_no_section():
-    assert harder_scenes_text([]) == ""
+def test_without_runs_there_is_no_table():
+    assert harder_scenes_table([]) == "No runs yet.\n"
