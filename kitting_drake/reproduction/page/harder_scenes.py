@@ -7,6 +7,8 @@ from typing import Any
 from kitting_drake.reproduction.page.markdown import markdown_table
 from kitting_drake.reproduction.page.runs import Run
 
+_FIRST_SEED = 52000
+"""The first seed of the runs of this table. Nobody had looked at these seeds before."""
 _POLICIES = {"generalist": "generalist", "shape_matching": "shape matching", "oracle": "oracle"}
 
 
@@ -50,9 +52,9 @@ def harder_scenes_table(runs: Sequence[Run]) -> str:
     largest forces and the number of right reasons to stop. Without runs the section is empty.
 
     Args:
-        runs: all runs. The runs of the table have names that begin with `scenes_`.
+        runs: all runs. Those of the table begin with the seed `_FIRST_SEED`.
     """
-    chosen = [run for run in runs if run.name.startswith("scenes_")]
+    chosen = [run for run in runs if run.summary["seeds"][0] == _FIRST_SEED]
     rows = []
     for row in _ROWS:
         found = {run.method: run.summary for run in chosen if _is_of(run, row)}

@@ -6,10 +6,11 @@ from kitting_drake.reproduction.page.harder_scenes import harder_scenes_table
 from kitting_drake.reproduction.page.runs import Run
 
 
-def run(name: str, scenario: str, method: str, share: float, **scene: Any) -> Run:
+def run(scenario: str, method: str, share: float, seed: int = 52000, **scene: Any) -> Run:
     resolved = {"task": {}, "sensor_noise": {"depth_std": 0.0}} | scene
     summary = {
         "policy": method,
+        "seeds": [seed],
         "policy_details": {"method": method},
         "scenario": scenario,
         "resolved_scenario": resolved,
@@ -20,7 +21,7 @@ def run(name: str, scenario: str, method: str, share: float, **scene: Any) -> Ru
     }
     if method == "generalist":
         summary["policy_details"] = {"method": "so2", "scenario": "static scenes"}
-    return Run(name, summary)
+    return Run("some", summary)
 
 
 def rows(text: str) -> dict[str, list[str]]:
@@ -35,12 +36,12 @@ def test_each_run_is_in_its_row():
     table = rows(
         harder_scenes_table(
             [
-                run("scenes_heap", "heaps:heap", "generalist", 0.75),
-                run("scenes_heap_matching", "heaps:heap", "shape_matching", 0.5),
-                run("scenes_unseen", unseen, "generalist", 0.98),
-                run("scenes_moderate", unseen, "generalist", 0.94, **noise),
-                run("scenes_public", "assembling_kits:Test", "oracle", 0.97, **shapes),
-                run("other_heap", "heaps:crossed", "generalist", 0.1),
+                run("heaps:heap", "generalist", 0.75),
+                run("heaps:heap", "shape_matching", 0.5),
+                run(unseen, "generalist", 0.98),
+                run(unseen, "generalist", 0.94, **noise),
+                run("assembling_kits:Test", "oracle", 0.97, **shapes),
+                run("heaps:crossed", "generalist", 0.1, seed=7),
             ]
         )
     )
