@@ -86,7 +86,7 @@ def test_a_folder_of_another_seed_or_version_is_refused(tmp_path: Path, monkeypa
     ours = draw_scenes._drawn_by()
     claimed = {"seed": 0, **ours}
     for other, message in [
-        ({"seed": 7}, "seed is 0, but 7 there"),
+        ({"seed": 7}, "seed is 0, but 7 in them"),
         ({"code": "1"}, f"{ours['code']}, but 1 there"),
         ({"catalogue": "2"}, f"{ours['catalogue']}, but 2 there"),
     ]:
