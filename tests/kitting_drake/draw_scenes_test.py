@@ -87,8 +87,8 @@ def test_a_folder_of_another_seed_or_version_is_refused(tmp_path: Path, monkeypa
     claimed = {"seed": 0, **ours}
     for other, message in [
         ({"seed": 7}, "seed is 0, but 7 in them"),
-        ({"code": "1"}, f"{ours['code']}, but 1 there"),
-        ({"catalogue": "2"}, f"{ours['catalogue']}, but 2 there"),
+        ({"code": "1"}, f"{ours['code']}, but 1 in them"),
+        ({"catalogue": "2"}, f"{ours['catalogue']}, but 2 in them"),
     ]:
         settings.write_text(json.dumps(claimed | other))
         with pytest.raises(UserError, match=message):
