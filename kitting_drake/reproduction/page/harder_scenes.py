@@ -8,7 +8,7 @@ from kitting_drake.reproduction.page.markdown import markdown_table
 from kitting_drake.reproduction.page.runs import Run
 
 _FIRST_SEED = 52000
-"""The first seed of the runs of this table. Nobody had looked at these seeds before."""
+"""The first seed of the runs of this table."""
 _POLICIES = {"generalist": "generalist", "shape_matching": "shape matching", "oracle": "oracle"}
 
 
@@ -34,7 +34,7 @@ _ROWS = (
     ),
     _Row("pairs of tools that touch", "heaps:touching"),
     _Row("pairs of tools, one across the other", "heaps:crossed"),
-    _Row("half of the tools lean on others", "heaps:leaning"),
+    _Row("half of the tools lean on the kit", "heaps:leaning"),
     _Row("a heap of four tools", "heaps:heap"),
     _Row("parts of 15 to 60 mm", "small_parts:SmallParts"),
     _Row("rings, plates, discs, boards and cylinders", "small_parts:RingsPlatesCylinders"),
@@ -48,8 +48,8 @@ _ROWS = (
 
 
 def harder_scenes_table(runs: Sequence[Run]) -> str:
-    """Writes the section: the strict success of each policy, and for the generalist also the
-    largest forces and the number of right reasons to stop. Without runs the section is empty.
+    """Writes the table: the strict success of each policy, and for the generalist also the largest
+    forces and the number of right reasons to stop. Without runs it is a sentence that says so.
 
     Args:
         runs: all runs. Those of the table begin with the seed `_FIRST_SEED`.
