@@ -48,7 +48,7 @@ def make_run(name: str, errors_mm: list[float]) -> Run:
             "demonstrations": cell.policy.demonstrations,
             "training_seed": cell.policy.seed,
             "steps": cell.policy.steps,
-            "learning_rate": 0.001,
+            "learning_rate": cell.policy.learning_rate or 0.001,
             "decay": True,
             "continuous": cell.continuous,
             "fit_outlines": cell.fit_outlines,

@@ -191,12 +191,12 @@ def test_some_tasks_choose_their_own_learning_rate(queue: Pretending):
     costs = {f"{rate:g}": 1.0 + (rate != LEARNING_RATES[1]) for rate in LEARNING_RATES}
     (queue.results / RATES).write_text(json.dumps({"unseen_transporter": costs}))
     cells = {cell.name: cell for cell in paper_cells()}
-    queue.train(cells["palletizing_boxes_transporter_36_10"].policy)
+    queue.train(cells["stack_block_pyramid_transporter_36_10"].policy)
     queue.train(cells["block_insertion_transporter_36_10"].policy)
     best = f"{LEARNING_RATES[0]:g}"
     assert [call for call in queue.calls if call.startswith("train")] == [
         *(f"train stack_block_pyramid_transporter_36_100_seed0_lr{r:g}" for r in LEARNING_RATES),
-        f"train palletizing_boxes_transporter_36_10_seed0_lr{best}",
+        f"train stack_block_pyramid_transporter_36_10_seed0_lr{best}",
         f"train block_insertion_transporter_36_10_seed0_lr{LEARNING_RATES[1]:g}",
     ]
     losses = {f"{rate:g}": 7.0 + (rate != LEARNING_RATES[0]) for rate in LEARNING_RATES}
