@@ -31,6 +31,9 @@ class _Row(VectorView):
     outcome = Number()
     """Index of the outcome in `OUTCOMES`."""
     peak_force = Number()
+    top = Number()
+    """The expected height of the placed object's top, in m in the world; NaN unless the object was
+    placed."""
     balance = Array(2)
     """Measured centre of mass of the object, x and y in the world in m; NaN unless the attempt set
     the object down again."""
@@ -55,6 +58,7 @@ class AttemptHistory:
         outcome: str,
         peak_force: float,
         balance: tuple[float, float] | None = None,
+        top: float | None = None,
     ) -> None:
         """Adds an attempt. If there is no room, the oldest one is dropped."""
         count = self._count()
@@ -65,6 +69,7 @@ class AttemptHistory:
         row.pick, row.place = action.pick.as_array(), action.place.as_array()
         row.press, row.aside = action.press, action.aside
         row.balance = (np.nan, np.nan) if balance is None else balance
+        row.top = np.nan if top is None else top
         self.amend(outcome, peak_force)
 
     def amend(self, outcome: str | None, peak_force: float) -> None:
@@ -83,7 +88,8 @@ class AttemptHistory:
             action = PickPlaceAction(pick, place, press=bool(row.press), aside=bool(row.aside))
             x, y = row.balance.tolist()
             balance = None if np.isnan(x) else (x, y)
-            found.append(Attempt(action, OUTCOMES[int(row.outcome)], row.peak_force, balance))
+            outcome, top = OUTCOMES[int(row.outcome)], None if np.isnan(row.top) else row.top
+            found.append(Attempt(action, outcome, row.peak_force, balance, top))
         return tuple(found)
 
     def failed_picks(self) -> tuple[PlanarPose, ...]:

@@ -27,5 +27,5 @@ def guarded_marks(
         return first, state.pick_top_z + margin if state.press else state.grasp_z
     # First either the object touches the floor of its place, or the fingertips touch the rim beside
     # the place. Use the higher contact.
-    hanging = state.hold_z - state.support_z
+    hanging = state.hold_z - state.support_z + state.hanging
     return first, max(state.floor_z + hanging, state.rim_z + state.doubt) + margin

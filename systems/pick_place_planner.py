@@ -298,7 +298,8 @@ class PickPlacePlanner(LeafSystem):
             history = AttemptHistory(discrete_state.get_mutable_value(self._history_index))
             outcome = _outcome(before, state)
             balance = _balance(state) if outcome == "set down" else None
-            history.append(_action_of(state), outcome, _peak(state), balance)
+            top = _top(state) if outcome == "placed" else None
+            history.append(_action_of(state), outcome, _peak(state), balance, top)
             state.free_actions += outcome == "set down"
 
     def _observe(
@@ -383,6 +384,11 @@ def _balance(state: PlannerState) -> tuple[float, float]:
     moment."""
     x, y, yaw = state.pick.tolist()
     return x + state.lever * math.cos(yaw), y + state.lever * math.sin(yaw)
+
+
+def _top(state: PlannerState) -> float:
+    """The height of the object's top at the place if it stands on the floor there, in m."""
+    return float(state.floor_z + state.pick_top_z - state.support_z)
 
 
 def _peak(state: PlannerState) -> float:

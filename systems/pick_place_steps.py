@@ -20,6 +20,7 @@ from systems.grip_force import (
     soft_force,
     turns_in_the_pads,
 )
+from systems.hanging import begin_lift, feel_weight, lift_higher
 from systems.pick_place_parameters import Mode, PickPlaceParameters
 from systems.planner_state import PlannerState, Z
 from systems.robot_motion import RobotMotion
@@ -37,6 +38,8 @@ _PUSH = 1 / 3
 with which the jaws follow their command."""
 _LONGEST_RELEASE = 1.0
 """After this time, in s, the hand rises even if the jaws stick."""
+_RISES = 0.02
+"""The hand counts as rising if its vertical speed is above this, in m/s."""
 _RISEN = 0.0005
 """The hand counts as lifted when it is this far, in m, above its height at the grip."""
 
@@ -166,6 +169,7 @@ class PickPlaceSteps:
         if self._is_held(hand, contact):
             state.hold_z, state.held_width = hand[2], hand[4] + hand[5]
             state.gentleness = state.trusts_grip = 0
+            begin_lift(state, float(hand[2]))
             # If the object is gripped higher than planned, it hangs lower below the fingertips.
             higher = max(hand[2] - state.grasp_z, 0.0)
             state.travel_z += higher
@@ -181,6 +185,7 @@ class PickPlaceSteps:
         desired = self._motion.motion_at(state, time)
         acceleration = float(self._motion.hand_acceleration(state, time, desired)[Z])
         weight = felt_weight(moment.contact[2], acceleration)
+        feel_weight(state, weight, float(moment.hand[2]))
         turning = moment.wrist_moment or 0.0
         at_rest = moment_at_rest(turning, acceleration)
         share = gentleness(weight, at_rest, float(state.gentleness), self._parameters)
@@ -260,10 +265,21 @@ class PickPlaceSteps:
             self._motion.begin(state, Mode.RETREAT, time)
         elif state.mode == Mode.LIFT:
             if self._motion.brakes_above(state, time, state.travel_z):
-                self._motion.begin(state, Mode.CARRY, time)
+                # An object that hangs lower than planned must first rise by as much.
+                following = Mode.LIFT if lift_higher(state) else Mode.CARRY
+                self._motion.begin(state, following, time)
+        elif self._hangs_lower(moment, weight):
+            self._motion.begin(state, Mode.LIFT, time)
         elif time >= self._motion.arrival(state) + self._settle:
             self._guard.tare(state, contact, self._parameters.contact_threshold)
             self._motion.begin(state, Mode.LOWER, time)
+
+    def _hangs_lower(self, moment: Moment, weight: float) -> bool:
+        """Whether the object proves to hang lower while the hand, in `CARRY`, still rises."""
+        if moment.hand[8] < _RISES:
+            return False
+        feel_weight(moment.state, weight, float(moment.hand[2]))
+        return lift_higher(moment.state)
 
     def _grip(self, moment: Moment, weight: float, turning: float) -> float:
         """Adapts the grip force to the object.

@@ -62,6 +62,13 @@ class PlannerState(VectorView):
     touch_z = Number()
     held_width = Number()
     """The opening of the jaws just after they gripped the object, in m."""
+    steady_weight = Number()
+    """The weight that the hand felt in `LIFT`, in N, when it changed last. `steady_z` is the height
+    of the fingertips then. `latest_weight` is the weight felt in the latest step."""
+    latest_weight = Number()
+    steady_z = Number()
+    hanging = Number()
+    """How far the object hangs below the height at which it was gripped, in m."""
     gentleness = Number()
     """The fraction of the acceleration limits that is used to move the held object; 0 stands for
     1."""

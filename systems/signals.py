@@ -324,6 +324,9 @@ class Attempt:
     """World (x, y), in metres, of the object's centre of mass; None unless the outcome is "set
     down". It is estimated from the moment on the wrist, which shows only the position along the
     pads."""
+    top: float | None = None
+    """World height, in metres, that the object's top should have at the place if it stands on the
+    floor there; None unless the outcome is "placed"."""
 
 
 def wrap_to_pi(angle: float) -> float:

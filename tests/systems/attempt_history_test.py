@@ -33,8 +33,9 @@ def test_a_report_comes_back():
 
 def test_a_felt_centre_of_mass_comes_back_and_tells_its_object_by_its_place():
     history = AttemptHistory(np.full(AttemptHistory.size, np.nan))
-    history.append(action(0), "placed", 1.0)
+    history.append(action(0), "placed", 1.0, top=0.04)
     history.append(action(0), "set down", 1.0, (0.4, 0.1))
+    assert [item.top for item in history.attempts()] == [0.04, None]
     assert [item.balance for item in history.attempts()] == [None, (0.4, 0.1)]
     assert history.set_downs(PlanarPose(0.42, 0.1)) == 1
     assert history.set_downs(PlanarPose(0.5, 0.1)) == 0

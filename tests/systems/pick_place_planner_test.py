@@ -33,6 +33,8 @@ GRASP_Z = 0.05 - PARAMETERS.grasp_depth
 HANGING = GRASP_Z
 """How far the held object extends below the fingertips. It stood on the table when gripped."""
 WIDTH, WEIGHT = 0.02, 6.0
+LIGHT = dataclasses.replace(PARAMETERS, heavy_load=2 * WEIGHT)
+"""Parameters with which the object is light, so that its grasp is not tried out."""
 NO_TOUCH = -1.0
 
 PICK_AND_PLACE = [mode for mode in Mode if mode < Mode.DONE]
@@ -57,6 +59,8 @@ class World:
         width: the object's width between the pads in m, by attempt (from 1) and mode.
         levers: by attempt, the distance (m) along the pads from the grasp to the object's centre
             of mass; zero for other attempts.
+        leaves: the height above the grasp up to which the table bears half of the object's weight,
+            in m.
         sticks: whether the jaws stick at the release, until a force opens them.
     """
 
@@ -66,6 +70,7 @@ class World:
     stiffness: float = 1e5
     width: Callable[[int, Mode], float] = lambda attempt, mode: WIDTH
     levers: tuple[float, ...] = ()
+    leaves: float = 0.0
     sticks: bool = False
 
 
@@ -131,10 +136,11 @@ class PerfectHand(LeafSystem):
         place = floor if first < q[3] < last else self._world.touch_place
         side = self._world.touch_pick if q[1] > 0 else place
         touch = max(side - q[2], 0.0) * self._world.stiffness
-        first_in_the_air = Mode.LIFT if self._world.levers else Mode.CARRY
-        in_the_air = self._eval(context, "mode")[0] >= first_in_the_air
+        in_the_air = self._eval(context, "mode")[0] >= Mode.LIFT
         # The held object adds its weight and inertia.
         mass = WEIGHT / 9.81 if in_the_air and press > 0 and pad > 0 else 0.0
+        if q[1] > 0 and q[2] < GRASP_Z + self._world.leaves:
+            mass /= 2
         load = -mass * (self._eval(context, "desired_motion")[8:11] + [0, 0, 9.81])
         force = np.array([*load, 0, pad, pad]) + [0, 0, touch, 0, 0, 0]
         world = self._world
@@ -539,6 +545,17 @@ def test_an_object_gripped_higher_than_planned_clears_the_rim(higher: float):
     assert bottom >= 0.05 + PARAMETERS.hover_clearance - 5e-4
 
 
+@pytest.mark.parametrize(("leaves", "hangs"), [(0.005, 0.0), (0.03, 0.03), (0.06, 0.06)])
+def test_an_object_that_leaves_the_table_late_hangs_lower_and_is_carried_higher(
+    leaves: float, hangs: float
+):
+    usual, late = (
+        Run(World(leaves=z), parameters=LIGHT).until(Mode.LOWER) for z in (0.001, leaves)
+    )
+    higher = late.output("desired_motion")[2] - usual.output("desired_motion")[2]
+    assert hangs - 0.002 < higher < hangs + 0.010
+
+
 @pytest.mark.parametrize("ramp", [0.05, 0.4])
 def test_the_closing_force_is_continuous_up_to_a_firm_grip(ramp: float):
     parameters = dataclasses.replace(
@@ -684,7 +701,7 @@ def test_motion_is_smooth_and_within_the_limits_of_its_mode(answer: PickPlaceAct
     speeds |= {Mode.DESCEND: p.descend_speed, Mode.LOWER: p.lower_speed}
     accelerations = dict.fromkeys(Mode, p.linear_acceleration)
     accelerations |= dict.fromkeys((Mode.LIFT, Mode.CARRY, Mode.LOWER), p.carry_acceleration)
-    run = Run(answer=answer)
+    run = Run(answer=answer, parameters=LIGHT)
     step = 1 / 512
     times, samples, modes = [], [], []
     while not samples or modes[-1] != Mode.DONE:
@@ -823,6 +840,12 @@ def test_what_a_stopping_policy_left_over_is_kept():
 
 def test_a_policy_that_reports_nothing_leaves_no_report():
     assert Run().finish().output("accepted_action").left_over is None
+
+
+def test_the_history_tells_how_high_a_seated_object_would_be():
+    heights = dataclasses.replace(HEIGHTS, support=0.01, place_floor=0.02)
+    (attempt,) = Run(answer=dataclasses.replace(ACTION, heights=heights)).finish().output("history")
+    assert attempt.top == pytest.approx(0.02 + 0.05 - 0.01)
 
 
 def test_aside_is_part_of_the_history():

@@ -14,6 +14,7 @@ from kitting_drake.policies.matching.assignment import Pair, match, reversed_obj
 from kitting_drake.policies.matching.regions.segmentation import Region, Segmentation, segment
 from kitting_drake.policies.matching.splitting import split_touching
 from systems.signals import Attempt, LeftOver, Observation, PlanarPose
+from systems.surface_heights import read_surface_heights
 
 _THERE = 0.015
 """An object within this distance of an earlier pick or place, in metres, counts as the object that
@@ -21,6 +22,9 @@ was picked or placed there."""
 _SAME_OBJECT = 0.060
 """If an object was left closer than this to a later pick, in metres, that pick was of this
 object."""
+_NOT_SEATED, _NOISE = 0.001, 4.0
+"""A placed object is not seated if its top is higher than expected by more than `_NOT_SEATED`, in
+metres, and by more than `_NOISE` standard deviations of the noise."""
 _MOST_TRIES = 3
 """The largest number of actions on one object."""
 _LEAST_SHARE = 0.5
@@ -174,6 +178,22 @@ class Inventory:
             elif removed:
                 return True
         return False
+
+    @property
+    def unseated(self) -> tuple[PlanarPose, ...]:
+        """The places in the kit where an object was let go and does not stand on the floor: it is
+        higher than it was on the table, relative to what it should stand on."""
+        observation = self.observation
+        doubt = max(_NOT_SEATED, _NOISE * self.segmentation.noise)
+        found = []
+        for moves in self._moves:
+            attempt, place = moves[-1], moves[-1].action.place
+            was_seated = attempt.outcome == "placed" and not attempt.action.aside
+            if attempt.top is None or not was_seated or not self._is_on_fixture(place):
+                continue
+            if read_surface_heights(observation, place, place).pick_top > attempt.top + doubt:
+                found.append(place)
+        return tuple(found)
 
     def balance(self, region: Region) -> NDArray[np.float64] | None:
         """Returns (row, col) of an object's centre of mass; None if the hand has not measured it

@@ -2,7 +2,8 @@
 
 An object that protrudes from the fixture is not seated. If it protrudes a little, it is pressed
 down once. If it protrudes more, or pressing did not help, it is taken out and laid on the table to
-be tried again. This uses only heights and is not in the paper.
+be tried again. An object that is jammed below the rim is pressed down once. This uses only heights
+and is not in the paper.
 """
 
 from __future__ import annotations
@@ -27,6 +28,10 @@ Array = NDArray[np.float64]
 
 _PRESSED = 0.012
 """An object that protrudes by more than this, in metres, is taken out rather than pressed down."""
+_BELOW = 0.0015
+"""An object in a recess is below the fixture's top by more than this, in metres."""
+_FAR = 0.75
+"""The far end of an object begins at this share of its largest distance from the grip."""
 _TRIED = 0.020
 """Presses or grasps closer together than this, in metres, count as the same."""
 _NEARBY = 12
@@ -59,6 +64,10 @@ def recovery_action(
         taken = _take_out(inventory, region, planner, tried)
         if taken is not None:
             return taken
+    for place in inventory.unseated:
+        pressed = _press_far_end(observation, segmentation, place)
+        if not _is_near(pressed.pick, tried):
+            return pressed
     return None
 
 
@@ -71,6 +80,33 @@ def _press(
     highest = pixels[heights >= np.percentile(heights, 80)].astype(float)
     middle = highest[np.linalg.norm(highest - np.median(highest, axis=0), axis=1).argmin()]
     action = make_action(observation, middle, 0.0, middle, 0.0)
+    return replace(action, press=True)
+
+
+def _press_far_end(
+    observation: Observation, segmentation: Segmentation, place: PlanarPose
+) -> PickPlaceAction:
+    """Returns the action that presses on an object that is jammed below the fixture's top.
+
+    The heavy end, which is nearer to the grip, falls first. The other end is the one that jams.
+
+    Args:
+        observation: the heightmap o_t.
+        segmentation: the regions of o_t.
+        place: where the object was let go, in the world.
+    """
+    at_place = observation.grid.to_pixel((place.x, place.y))
+    labels, _ = ndimage.label(segmentation.depth > _BELOW)
+    row, col = np.rint(at_place).astype(int)
+    middle = at_place
+    if labels[row, col]:
+        inside = ndimage.distance_transform_edt(labels == labels[row, col])
+        pixels = np.argwhere(inside)
+        away = np.linalg.norm(pixels - at_place, axis=1)
+        end = pixels[away >= _FAR * away.max()]
+        # Closed jaws need room, so press on the middle of the end.
+        middle = end[inside[tuple(end.T)].argmax()].astype(float)
+    action = make_action(observation, middle, place.theta, middle, 0.0)
     return replace(action, press=True)
 
 

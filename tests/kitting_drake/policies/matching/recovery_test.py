@@ -108,3 +108,24 @@ def test_of_entangled_objects_the_topmost_that_can_be_gripped_is_taken_out():
     assert action is not None and action.aside
     row, col = GRID.to_pixel((action.pick.x, action.pick.y))
     assert 87 < row < 94 and 95 < col < 112
+
+
+@pytest.mark.parametrize(("higher", "presses"), [(0.0, False), (0.0005, False), (0.002, True)])
+def test_an_object_that_is_jammed_below_the_rim_is_pressed_once_at_its_far_end(
+    higher: float, presses: bool
+):
+    height = observed().height.copy()
+    height[61:65, 76:124] = TOP - 0.006
+    image = np.zeros((4, *GRID.shape), np.float32)
+    image[3] = height
+    put = move((140.0, 280.0), (63.0, 85.0), aside=False)
+    seen = dataclasses.replace(
+        Observation(image, GRID, np.ones(GRID.shape, bool)),
+        history=(dataclasses.replace(put, top=TOP - 0.006 - higher),),
+    )
+    action = mending(seen)
+    assert (action is not None and action.press) is presses
+    if action is not None:
+        row, col = GRID.to_pixel((action.pick.x, action.pick.y))
+        assert 61 < row < 64 and 105 < col < 124
+        assert mending(seen, [action.pick]) is None
