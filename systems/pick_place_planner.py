@@ -116,6 +116,8 @@ class PickPlacePlanner(LeafSystem):
       lifts it by 1 cm first, and rests. If the object turns between the pads, or the moment is more
       than friction holds on the way (`slips_when_carried`), it is set down again. The history then
       contains the estimated centre of mass, so that a policy can grip the object there.
+      An object that leaves the table late hangs lower than it lay, because it turned or another
+      object is caught in it; it is lifted and carried higher by as much (`hanging`).
     - `RELEASE`: if the jaws stick to the object, they open with force.
     - `SEARCH`: in tasks that insert objects into cavities, if the object stands on the rim around
       its place, the hand searches for the cavity. When the resistance ends, it lowers the object
