@@ -17,8 +17,9 @@ _YAWS = 8
 """The number of headings that are tried, over a full turn."""
 _LEAST = 0.010
 """Least clearance around the object, in metres."""
-_AMPLE = 0.060
-"""Clearance beyond this, in metres, has no benefit: the open hand already has room."""
+_AMPLE = 0.100
+"""Clearance beyond this, in metres, has no benefit: the open hand already has room, beside a kit
+that reaches up to its palm too."""
 _WAY = 0.02
 """Each metre of distance from the wanted point counts as much as this loss of clearance, in
 metres."""

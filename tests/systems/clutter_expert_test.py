@@ -101,6 +101,19 @@ def test_a_tool_between_others_is_gripped_where_it_is_free():
     assert action.pick.x == pytest.approx(0.5 - 0.075, abs=0.03)
 
 
+def test_a_tool_beside_the_tall_kit_is_laid_where_the_hand_has_room():
+    # The palm would hit the kit, 8 cm away.
+    start = pose(0.5, -0.08)
+    clutter = expert(start)
+    assert to_goal(clutter) is None
+    action = clutter.aside([0])
+    assert action is not None
+    turn = RollPitchYaw(0, 0, action.place.theta - action.pick.theta).ToRotationMatrix()
+    moved = turn @ (start.translation() - [action.pick.x, action.pick.y, 0.0])
+    laid = RigidTransform(turn, moved + [action.place.x, action.place.y, 0.0])
+    assert to_goal(expert(laid)) is not None
+
+
 def test_a_failed_grasp_is_not_repeated():
     action = to_goal(expert(pose(0.5, 0.2), failed=(PlanarPose(0.5, 0.2, math.pi),)))
     assert action is not None
