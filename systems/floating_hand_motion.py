@@ -190,12 +190,13 @@ class HandMotion(JawMotion):
             return limits
         return replace(
             limits,
+            speed=share * limits.speed,
             acceleration=share * limits.acceleration,
             yaw_acceleration=share * limits.yaw_acceleration,
         )
 
     def slow_down(self, state: PlannerState, time: float, share: float) -> None:
-        """Continues the present motion with less acceleration. See `RobotMotion`."""
+        """Continues the present motion with less acceleration and speed. See `RobotMotion`."""
         now, rate, _ = np.split(self.motion_at(state, time), 3)
         opening, _ = self.opening_at(state, time)
         state.start_opening = state.goal_opening = opening

@@ -32,8 +32,8 @@ _MUCH_LESS = 0.85
 """When the jaws sink into an object, a lower force is used only if it is at most this fraction of
 the present one."""
 _GENTLE, _GENTLEST = 0.5, 0.25
-"""Fractions of the acceleration limits. An object that may turn is moved with at most `_GENTLE` of
-them; no object is moved with less than `_GENTLEST` of them."""
+"""Fractions of the limits of speed and acceleration. An object that may turn is moved with at most
+`_GENTLE` of them; no object is moved with less than `_GENTLEST` of them."""
 _GENTLER = 0.8
 """A lower acceleration is used only if it is below this fraction of the present one, because each
 change restarts the motion."""
@@ -110,7 +110,7 @@ def soft_force(
 def gentleness(
     weight: float, moment: float, present: float, parameters: PickPlaceParameters
 ) -> float:
-    """The fraction of the acceleration limits that is used to move an object of a given weight.
+    """The fraction of the limits of speed and acceleration that is used to move an object.
 
     It is 1 up to `heavy_load`, and inversely proportional to the weight above that load. If the
     object may turn between the pads, the fraction is at most a half. It never rises while the

@@ -11,9 +11,12 @@ _TOLERANCE, _LEAST_TOLERANCE = 0.12, 0.3
 """The felt weight counts as changed if two samples in a row differ from its earlier value by more
 than this fraction of it, and by more than `_LEAST_TOLERANCE`, in N. A single sample is wrong when
 the hand begins to brake."""
-_RAISED = 0.012
+_RAISED = 0.008
 """Below this height above the grip, in m, the weight also changes because the pads yield and the
 hand accelerates."""
+_MORE = 1.5
+"""An object that has turned between the pads turns further on the way. It is taken to hang lower by
+this factor."""
 _MOST = 0.12
 """Largest distance by which the planner takes an object to hang lower, in m."""
 _NOTABLE = 0.003
@@ -58,7 +61,7 @@ def lift_higher(state: PlannerState) -> bool:
         Whether the lift must go on.
     """
     late = state.steady_z - state.hold_z
-    hangs = min(late, _MOST) if late > _RAISED else 0.0
+    hangs = min(_MORE * late, _MOST) if late > _RAISED else 0.0
     more = hangs - state.hanging
     if more < _NOTABLE:
         return False

@@ -111,7 +111,7 @@ class PickPlacePlanner(LeafSystem):
     - `LIFT`, `CARRY`: the more the object weighs, and the larger the moment of its weight about the
       axis of the pads, the more firmly it is gripped (`grip_force`), but less firmly if the jaws
       sink in (`soft_force`). A heavy object is lifted only once the grip is firm. A floating hand
-      moves it with less acceleration (`gentleness`).
+      moves it with less speed and acceleration (`gentleness`).
     - `LIFT`: if the object is heavy or its moment about the axis of the pads is notable, the hand
       lifts it by 1 cm first, and rests. If the object turns between the pads, or the moment is more
       than friction holds on the way (`slips_when_carried`), it is set down again. The history then

@@ -70,8 +70,8 @@ class PlannerState(VectorView):
     hanging = Number()
     """How far the object hangs below the height at which it was gripped, in m."""
     gentleness = Number()
-    """The fraction of the acceleration limits that is used to move the held object; 0 stands for
-    1."""
+    """The fraction of the limits of speed and acceleration that is used to move the held object; 0
+    stands for 1."""
     search_step = Number()
     payload = Number()
     """The vertical force of the payload on the hand, in N; negative or zero."""

@@ -66,12 +66,12 @@ class RobotMotion(Protocol):
         hand moves straight."""
 
     def slow_down(self, state: PlannerState, time: float, share: float) -> None:
-        """Continues with less acceleration, in this mode and in later ones that move the object.
+        """Continues with less speed and acceleration, in this and later modes that move the object.
 
         Args:
             state: the planner's state; modified.
             time: the present time.
-            share: the fraction of the acceleration limits that the motion may use.
+            share: the fraction of the limits of speed and acceleration that the motion may use.
         """
 
     def motion_at(self, state: PlannerState, time: float) -> NDArray[np.float64]:

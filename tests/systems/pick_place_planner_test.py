@@ -545,7 +545,7 @@ def test_an_object_gripped_higher_than_planned_clears_the_rim(higher: float):
     assert bottom >= 0.05 + PARAMETERS.hover_clearance - 5e-4
 
 
-@pytest.mark.parametrize(("leaves", "hangs"), [(0.005, 0.0), (0.03, 0.03), (0.06, 0.06)])
+@pytest.mark.parametrize(("leaves", "hangs"), [(0.003, 0.0), (0.03, 0.045), (0.06, 0.09)])
 def test_an_object_that_leaves_the_table_late_hangs_lower_and_is_carried_higher(
     leaves: float, hangs: float
 ):
@@ -553,7 +553,7 @@ def test_an_object_that_leaves_the_table_late_hangs_lower_and_is_carried_higher(
         Run(World(leaves=z), parameters=LIGHT).until(Mode.LOWER) for z in (0.001, leaves)
     )
     higher = late.output("desired_motion")[2] - usual.output("desired_motion")[2]
-    assert hangs - 0.002 < higher < hangs + 0.010
+    assert hangs - 0.002 < higher < hangs + 0.015
 
 
 @pytest.mark.parametrize("ramp", [0.05, 0.4])
