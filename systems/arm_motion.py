@@ -36,9 +36,6 @@ _SAME_HEIGHT = 0.003
 _HELD_REACH = 0.125
 """A held object reaches at most this far from the fingertips, in m. `read_surface_heights` assumes
 the same."""
-_JAW_ROOM = 0.005
-"""Distance of each pad from an object of known width before the jaws close, in m."""
-
 _TOUCH_SPEED = 0.011
 """Upper limit of `touch_speed` for an arm, in m/s. The force of an impact is proportional to mass
 times speed. The mass that moves with an arm's hand is 10 to 25 kg; with the floating hand it is 4
@@ -184,10 +181,6 @@ class ArmMotion(JawMotion):
             if touched:
                 return f"on the way to the {name} the arm would collide with {touched}"
         return ""
-
-    def wide(self, state: PlannerState) -> float:
-        """The opening of the jaws before a grasp: the object's width plus some clearance, in m."""
-        return min(self._parameters.open_width, state.width + 2 * _JAW_ROOM)
 
     def begin(
         self,

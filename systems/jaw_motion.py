@@ -6,6 +6,9 @@ from systems.hand_motion import ramp
 from systems.pick_place_parameters import Mode, PickPlaceParameters
 from systems.planner_state import PlannerState
 
+_ROOM = 0.005
+"""Distance of each pad from an object of known width before the jaws close, in m."""
+
 
 class JawMotion:
     """Computes jaw openings and closing forces in all modes from the planner's state."""
@@ -27,8 +30,8 @@ class JawMotion:
         state.force_start_time = -self._parameters.force_ramp
 
     def wide(self, state: PlannerState) -> float:
-        """The opening of the jaws before a grasp, in m."""
-        return self._parameters.open_width
+        """The opening of the jaws before a grasp: the object's width plus some clearance, in m."""
+        return min(self._parameters.open_width, state.width + 2 * _ROOM)
 
     def begin_jaws(
         self, state: PlannerState, mode: Mode, time: float, opening: float | None
