@@ -35,7 +35,7 @@ APART = "apart"
 """The kind of start in which tools lie apart. It needs no simulation."""
 
 _TRAY_WALL, _TRAY_FLOOR = 0.004, 0.003
-_REDRAWS = 40
+_REDRAWS = 200
 """A start is drawn and settled at most this many times."""
 _TRIES, _RESTARTS = 200, 20
 
