@@ -28,6 +28,8 @@ class _Row(VectorView):
     place = Array(3)
     press = Number()
     aside = Number()
+    middle = Array(2)
+    """The middle of the picked object, x and y in the world in m; NaN if unknown."""
     outcome = Number()
     """Index of the outcome in `OUTCOMES`."""
     peak_force = Number()
@@ -68,6 +70,7 @@ class AttemptHistory:
         row = _Row(self._rows[count])
         row.pick, row.place = action.pick.as_array(), action.place.as_array()
         row.press, row.aside = action.press, action.aside
+        row.middle = (np.nan, np.nan) if action.middle is None else action.middle
         row.balance = (np.nan, np.nan) if balance is None else balance
         row.top = np.nan if top is None else top
         self.amend(outcome, peak_force)
@@ -85,9 +88,14 @@ class AttemptHistory:
         for values in self._rows[: self._count()]:
             row = _Row(values)
             pick, place = (PlanarPose(*pose.tolist()) for pose in (row.pick, row.place))
-            action = PickPlaceAction(pick, place, press=bool(row.press), aside=bool(row.aside))
-            x, y = row.balance.tolist()
-            balance = None if np.isnan(x) else (x, y)
+            action = PickPlaceAction(
+                pick,
+                place,
+                press=bool(row.press),
+                aside=bool(row.aside),
+                middle=_known(row.middle),
+            )
+            balance = _known(row.balance)
             outcome, top = OUTCOMES[int(row.outcome)], None if np.isnan(row.top) else row.top
             found.append(Attempt(action, outcome, row.peak_force, balance, top))
         return tuple(found)
@@ -109,6 +117,11 @@ class AttemptHistory:
 
     def _count(self) -> int:
         return int(np.count_nonzero(~np.isnan(self._rows[:, 0])))
+
+
+def _known(point: NDArray[np.float64]) -> tuple[float, float] | None:
+    x, y = point.tolist()
+    return None if np.isnan(x) else (x, y)
 
 
 class LeftOverVector:

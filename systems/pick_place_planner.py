@@ -323,6 +323,7 @@ class PickPlacePlanner(LeafSystem):
             action = dataclasses.replace(action, place=action.pick)
         self._set_heights(state, self._heights(context, action))
         state.search_step, state.press, state.aside = 0, action.press, action.aside
+        state.middle = np.nan if action.middle is None else action.middle
         state.stops = state.doubts_grip = 0
         kept = AttemptHistory(discrete_state.get_mutable_value(self._history_index))
         state.set_downs = kept.set_downs(action.pick)
@@ -366,6 +367,9 @@ def _action_of(state: PlannerState) -> PickPlaceAction:
         reason=list(STOP_REASONS)[int(state.stop) - 1] if state.stop else "",
         press=bool(state.press),
         aside=bool(state.aside),
+        middle=None
+        if np.isnan(state.middle[0])
+        else (float(state.middle[0]), float(state.middle[1])),
     )
 
 

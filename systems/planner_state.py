@@ -104,6 +104,8 @@ class PlannerState(VectorView):
     """1 if the action presses, else 0."""
     aside = Number()
     """1 if the action lays the object aside, else 0."""
+    middle = Array(2)
+    """The action's `middle`, in m; NaN if it is None."""
     lever = Number()
     """Position of the object's centre of mass relative to the pads' middle, along the pads, in m.
     It is recorded in the history if the object is set down again."""

@@ -272,6 +272,9 @@ class PickPlaceAction:
     """Whether the hand only pushes down at the pick with closed jaws. The place is then ignored."""
     aside: bool = False
     """Whether the object is laid on a free part of the table instead of moved to its goal."""
+    middle: tuple[float, float] | None = None
+    """World (x, y), in metres, of the middle of the picked object as the policy sees it; None if
+    unknown. It tells objects apart in the `history`, wherever they are gripped."""
     left_over: LeftOver | None = None
     """The objects and cavities that a policy still sees when it stops; None if it does not report
     them."""

@@ -123,7 +123,7 @@ class LearnedPolicy:
         """
         draft = self._draft(observation, failed_picks)
         if draft.mending is not None:
-            return draft.mending, None
+            return draft.look.inventory.named(draft.mending), None
         decision = _decision(draft)
         if self._watch is not None:
             self._watch(observation, decision)
@@ -160,6 +160,8 @@ def _decision(draft: Draft) -> Decision:
     action = make_action(
         draft.look.observation, draft.pick, draft.theta, draft.place, draft.rotation
     )
+    if draft.outlined:
+        action = draft.look.inventory.named(action)
     return Decision(
         action=dataclasses.replace(
             action, stop=draft.stop, reason=draft.reason, left_over=_left_over(draft)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from kitting_drake.policies.data.images import make_action
 from kitting_drake.policies.draft import Draft, Stage, expected_position
 from kitting_drake.policies.matching.inventory import mask_of
 from kitting_drake.policies.matching.recovery import recovery_action
@@ -317,7 +318,10 @@ class Recovery:
         if mending is not None and mending.press:
             return dataclasses.replace(draft, mending=mending)
         if draft.belongs and not draft.stop:
-            return draft
+            poses = draft.pick, draft.theta, draft.place, draft.rotation
+            action = make_action(look.observation, *poses)
+            obstructed = mending is not None and look.inventory.is_obstructed(action)
+            return dataclasses.replace(draft, mending=mending) if obstructed else draft
         if draft.stop:
             arguments = look.inventory, self.planner, look.failed_picks
             mending = separating_action(*arguments) or mending or turning_action(*arguments)

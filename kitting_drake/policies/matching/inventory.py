@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from kitting_drake.policies.data.images import rotation_matrix
 from kitting_drake.policies.matching.assignment import Pair, match, reversed_objects
+from kitting_drake.policies.matching.refinement import nearest_region
 from kitting_drake.policies.matching.regions.segmentation import Region, Segmentation, segment
 from kitting_drake.policies.matching.splitting import split_touching
-from systems.signals import Attempt, LeftOver, Observation, PlanarPose
+from systems.signals import Attempt, LeftOver, Observation, PickPlaceAction, PlanarPose
 from systems.surface_heights import read_surface_heights
 
 _THERE = 0.015
@@ -22,11 +24,15 @@ was picked or placed there."""
 _SAME_OBJECT = 0.060
 """If an object was left closer than this to a later pick, in metres, that pick was of this
 object."""
+_OBSTRUCTED = 0.05
+"""A place is obstructed if more than this share of the object would lie on protruding things."""
 _NOT_SEATED, _NOISE = 0.001, 4.0
 """A placed object is not seated if its top is higher than expected by more than `_NOT_SEATED`, in
 metres, and by more than `_NOISE` standard deviations of the noise."""
 _MOST_TRIES = 3
 """The largest number of actions on one object."""
+_MOST_REMOVALS = 3
+"""The largest number of objects that are taken out of one part of the kit."""
 _LEAST_SHARE = 0.5
 """A region that contains an object for an open recess has at least this share of the smallest open
 recess's area."""
@@ -161,14 +167,42 @@ class Inventory:
     def tries(self, region: Region) -> int:
         """Returns how many earlier actions moved the object that lies in this region to where it
         lies, or failed to move it away. Of several objects, the one that was left there last
-        counts."""
+        counts. Two actions that set the object down again count as one, because each shows better
+        where it must be gripped."""
         last = (self._moves_of(region) or [[]])[-1]
-        return sum(self._is_there(_left_at(attempt), region) for attempt in last)
+        here = [item.outcome for item in last if self._is_there(_left_at(item), region)]
+        return len(here) - (here.count("set down") + 1) // 2
 
-    def was_removed(self, pick: PlanarPose) -> bool:
-        """Whether earlier actions took the object at a pick out of the kit, and then placed it
-        there again."""
-        index = _nearest(self._moves, pick)
+    def named(self, action: PickPlaceAction) -> PickPlaceAction:
+        """Returns an action with the middle of the object that it picks, if it picks one."""
+        if action.stop or action.press:
+            return action
+        pixel = np.array(self.observation.grid.to_pixel((action.pick.x, action.pick.y)))
+        loose = (*self.segmentation.objects, *self.segmentation.protruding)
+        region = nearest_region(loose, pixel)
+        return action if region is None else replace(action, middle=self._middle(region))
+
+    def is_obstructed(self, action: PickPlaceAction) -> bool:
+        """Whether a protruding object must be taken out of the kit before an action: it lies where
+        the action would put its object, or another one was taken out before it."""
+        if self._removals:
+            return True
+        grid, turn = self.observation.grid, action.place.theta - action.pick.theta
+        pick, place = (np.array(grid.to_pixel((p.x, p.y))) for p in (action.pick, action.place))
+        region = nearest_region(self.segmentation.objects, pick)
+        if region is None:
+            return False
+        target = np.rint(place + (region.pixels - pick) @ rotation_matrix(turn).T).astype(int)
+        target = target[((target >= 0) & (target < grid.shape)).all(axis=1)]
+        mask = mask_of(self.segmentation.protruding, grid.shape)
+        return bool(mask[tuple(target.T)].sum() > _OBSTRUCTED * len(region.pixels))
+
+    def was_removed(self, region: Region) -> bool:
+        """Whether earlier actions took the object in a region out of the kit, and then placed it
+        there again, or took out `_MOST_REMOVALS` objects there."""
+        if sum(self._is_there(pick, region) for pick in self._removals) >= _MOST_REMOVALS:
+            return True
+        index = _nearest(self._moves, self._middle(region))
         removed = False
         for attempt in [] if index is None else self._moves[index]:
             if attempt.outcome != "placed":
@@ -213,14 +247,20 @@ class Inventory:
         """The earlier actions on each object, oldest first. The object that was moved last comes
         last.
 
-        An action is on the object that was left nearest to its pick, if that is within
-        `_SAME_OBJECT`; else on an object that no action was on before.
+        An action is on the object whose middle was left nearest to the middle of its own object, if
+        that is within `_SAME_OBJECT`; else on an object that no action was on before.
         """
         objects: list[list[Attempt]] = []
         for attempt in self._history:
-            index = _nearest(objects, attempt.action.pick)
+            index = _nearest(objects, _found_at(attempt))
             objects.append([*([] if index is None else objects.pop(index)), attempt])
         return objects
+
+    @property
+    def _removals(self) -> list[PlanarPose]:
+        """The picks at which earlier actions took objects out of the kit."""
+        done = [item.action for item in self._history if item.outcome == "placed"]
+        return [item.pick for item in done if item.aside and self._is_on_fixture(item.pick)]
 
     def _may_contain(self, region: Region, count: int) -> bool:
         """Whether a region is so large that it may contain this many objects for open recesses."""
@@ -266,21 +306,39 @@ class Inventory:
         return float(x), float(y)
 
 
-def _nearest(objects: Sequence[Sequence[Attempt]], pick: PlanarPose) -> int | None:
-    """Returns the index of the object that was left nearest to a pick; None if none was left within
-    `_SAME_OBJECT`. Of objects that were left at almost the same place, the last one lies on top.
+def _nearest(objects: Sequence[Sequence[Attempt]], middle: tuple[float, float]) -> int | None:
+    """Returns the index of the object that was left nearest to a point; None if none was left
+    within `_SAME_OBJECT`. Of objects that were left at almost the same place, the last one lies on
+    top.
 
     Args:
         objects: the actions on each object, oldest first; the object that was moved last comes
             last.
-        pick: the pick, in the world.
+        middle: the middle of an object, in the world.
     """
     if not objects:
         return None
-    left = [_left_at(moves[-1]) for moves in objects]
-    away = np.array([math.hypot(pose.x - pick.x, pose.y - pick.y) for pose in left])
+    away = np.array([math.dist(_middle_left_at(moves[-1]), middle) for moves in objects])
     nearest = int(np.flatnonzero(away < away.min() + _THERE)[-1])
     return nearest if away[nearest] < _SAME_OBJECT else None
+
+
+def _found_at(attempt: Attempt) -> tuple[float, float]:
+    """Returns the middle of an action's object before the action; if unknown, the pick."""
+    pick = attempt.action.pick
+    return attempt.action.middle or (pick.x, pick.y)
+
+
+def _middle_left_at(attempt: Attempt) -> tuple[float, float]:
+    """Returns the middle of an action's object after the action; if unknown, the point at which it
+    was gripped."""
+    action, left = attempt.action, _left_at(attempt)
+    if action.middle is None:
+        return left.x, left.y
+    x, y = action.middle[0] - action.pick.x, action.middle[1] - action.pick.y
+    turn = left.theta - action.pick.theta
+    cos, sin = math.cos(turn), math.sin(turn)
+    return left.x + cos * x - sin * y, left.y + sin * x + cos * y
 
 
 def _left_at(attempt: Attempt) -> PlanarPose:

@@ -129,7 +129,7 @@ def _take_out(
     for part in (region, *topmost_layers(segmentation, region)):
         for grasp in jaw_grasps(segmentation, part, resolution, planner, support=top):
             action = make_action(observation, grasp.pixel, grasp.theta, free, 0.0)
-            if not _is_near(action.pick, tried) and not inventory.was_removed(action.pick):
+            if not _is_near(action.pick, tried) and not inventory.was_removed(part):
                 return replace(action, aside=True)
     return None
 

@@ -67,6 +67,8 @@ class ShapeMatchingPolicy:
             return Matched(mending)
         matched, reason = self._insert(inventory, failed_picks)
         if matched is not None:
+            if mending is not None and inventory.is_obstructed(matched.action):
+                return Matched(inventory.named(mending))
             return matched
         if self._recover:
             arguments = inventory, self._planner, failed_picks
@@ -74,7 +76,7 @@ class ShapeMatchingPolicy:
             # the number of actions is limited.
             prepared = separating_action(*arguments) or mending or turning_action(*arguments)
             if prepared is not None:
-                return Matched(prepared)
+                return Matched(inventory.named(prepared))
         reason = reason or inventory.why_stop
         return Matched(PickPlaceAction(stop=True, reason=reason, left_over=inventory.left_over))
 
@@ -105,5 +107,5 @@ class ShapeMatchingPolicy:
                 geometry = geometric_evidence(
                     segmentation, best.pixel, fit.rotation, place, fit.cost, best.cost
                 )
-                return Matched(action, geometry), ""
+                return Matched(inventory.named(action), geometry), ""
         return None, reason

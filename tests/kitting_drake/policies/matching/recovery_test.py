@@ -92,7 +92,42 @@ def test_an_object_is_not_taken_out_again_after_it_was_put_back():
         # Afterwards another object was placed there.
         ((put, out, other), False),
         ((put, out, back, other), False),
+        # However many objects are placed there, only three are taken out.
+        ((put, out, other, out, other, out, other), True),
     ):
+        observation = dataclasses.replace(observed(0.014), history=history)
+        assert (mending(observation) is None) is gives_up
+
+
+@pytest.mark.parametrize(
+    ("place", "removed", "obstructed"),
+    [((94.0, 100.0), False, True), ((63.0, 100.0), False, False), ((63.0, 100.0), True, True)],
+)
+def test_what_protrudes_is_taken_out_before_the_next_object_goes_there(
+    place: tuple[float, float], removed: bool, obstructed: bool
+):
+    out = move((94.0, 100.0), (30.0, 250.0), aside=True)
+    seen = dataclasses.replace(observed(0.014), history=(out,) if removed else ())
+    action = move((103.0, 245.0), place, aside=False).action
+    assert Inventory.of(seen).is_obstructed(action) is obstructed
+
+
+def test_an_object_is_known_again_wherever_it_is_gripped():
+    """The object is gripped at its left end, and taken out at its right end."""
+    left, right, table = (94.0, 80.0), (94.0, 118.0), (30.0, 250.0)
+    seat, laid = ((94.0, 99.0), (30.0, 231.0))
+
+    def at(attempt: Attempt, pixel: tuple[float, float]) -> Attempt:
+        middle = tuple(GRID.to_world(pixel).tolist())
+        return dataclasses.replace(
+            attempt, action=dataclasses.replace(attempt.action, middle=middle)
+        )
+
+    away = (140.0, 280.0)
+    put = at(move(away, left, aside=False), (140.0, 299.0))
+    out = at(move(right, table, aside=True), seat)
+    back = at(move((30.0, 212.0), left, aside=False), laid)
+    for history, gives_up in (((put, out), False), ((put, out, back), True)):
         observation = dataclasses.replace(observed(0.014), history=history)
         assert (mending(observation) is None) is gives_up
 
