@@ -4,10 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from kitting_drake.reproduction.page.markdown import markdown_table
+from kitting_drake.reproduction.page.markdown import markdown_table, rate_text
 from kitting_drake.reproduction.page.runs import Run
 
-_FIRST_SEED = 52000
+_FIRST_SEED = 54000
 """The first seed of the runs of this table."""
 _POLICIES = {"generalist": "generalist", "shape_matching": "shape matching", "oracle": "oracle"}
 
@@ -64,7 +64,12 @@ def harder_scenes_table(runs: Sequence[Run]) -> str:
         rows.append(
             [
                 row.label,
-                *(_strict(found[key]) if key in found else "-" for key in _POLICIES),
+                *(
+                    rate_text(found[key]["strict_success_rate"], found[key]["strict_ci95"])
+                    if key in found
+                    else "-"
+                    for key in _POLICIES
+                ),
                 _forces(shown) if shown else "-",
                 _reasons(shown) if shown else "-",
             ]
@@ -82,12 +87,6 @@ def _is_of(run: Run, row: _Row) -> bool:
         and bool(scenario["sensor_noise"]["depth_std"]) == row.perturbed
         and (not scenario["task"].get("shapes")) == row.own_shapes
     )
-
-
-def _strict(summary: dict[str, Any]) -> str:
-    low, high = summary["strict_ci95"]
-    rate = summary["strict_success_rate"]
-    return f"{100 * rate:.1f} ({100 * low:.0f} to {100 * high:.0f})"
 
 
 def _forces(summary: dict[str, Any]) -> str:
