@@ -306,8 +306,9 @@ class Recovery:
     """Corrects failed insertions (`recovery_action`), takes heaps apart (`separating_action`), and
     turns objects over (`turning_action`).
 
-    It presses a protruding object down at once. The other corrections take several actions, so they
-    come only when no object fits into a recess.
+    It presses a protruding object down at once, and takes it out if the next object needs its place
+    (`Inventory.needs_clearing`). The other corrections take several actions, so they come only when
+    no object fits into a recess.
     """
 
     planner: PickPlaceParameters
@@ -320,8 +321,8 @@ class Recovery:
         if draft.belongs and not draft.stop:
             poses = draft.pick, draft.theta, draft.place, draft.rotation
             action = make_action(look.observation, *poses)
-            obstructed = mending is not None and look.inventory.is_obstructed(action)
-            return dataclasses.replace(draft, mending=mending) if obstructed else draft
+            first = mending is not None and look.inventory.needs_clearing(action)
+            return dataclasses.replace(draft, mending=mending) if first else draft
         if draft.stop:
             arguments = look.inventory, self.planner, look.failed_picks
             mending = separating_action(*arguments) or mending or turning_action(*arguments)

@@ -182,7 +182,7 @@ class Inventory:
         region = nearest_region(loose, pixel)
         return action if region is None else replace(action, middle=self._middle(region))
 
-    def is_obstructed(self, action: PickPlaceAction) -> bool:
+    def needs_clearing(self, action: PickPlaceAction) -> bool:
         """Whether a protruding object must be taken out of the kit before an action: it lies where
         the action would put its object, or another one was taken out before it."""
         if self._removals:

@@ -38,7 +38,8 @@ class ShapeMatchingPolicy:
         Args:
             planner: parameters of the motion with which the hand will pick and place.
             recover: whether to prepare objects that cannot be placed yet. Protruding objects are
-                pressed down at once. If nothing fits, the policy takes heaps apart
+                pressed down at once, and taken out if the next object needs their place. If nothing
+                fits, the policy takes heaps apart
                 (`separating_action`), then takes out objects that could not be pressed down
                 (`recovery_action`), then turns over objects that lie upside down
                 (`turning_action`).
@@ -67,7 +68,7 @@ class ShapeMatchingPolicy:
             return Matched(mending)
         matched, reason = self._insert(inventory, failed_picks)
         if matched is not None:
-            if mending is not None and inventory.is_obstructed(matched.action):
+            if mending is not None and inventory.needs_clearing(matched.action):
                 return Matched(inventory.named(mending))
             return matched
         if self._recover:

@@ -109,7 +109,7 @@ def test_what_protrudes_is_taken_out_before_the_next_object_goes_there(
     out = move((94.0, 100.0), (30.0, 250.0), aside=True)
     seen = dataclasses.replace(observed(0.014), history=(out,) if removed else ())
     action = move((103.0, 245.0), place, aside=False).action
-    assert Inventory.of(seen).is_obstructed(action) is obstructed
+    assert Inventory.of(seen).needs_clearing(action) is obstructed
 
 
 def test_an_object_is_known_again_wherever_it_is_gripped():
