@@ -9,6 +9,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from kitting_drake.policies.data.images import rotation_matrix
 from kitting_drake.policies.matching.assignment import Pair, match, reversed_objects
@@ -31,6 +32,8 @@ _NOT_SEATED, _NOISE = 0.001, 4.0
 metres, and by more than `_NOISE` standard deviations of the noise."""
 _MOST_TRIES = 3
 """The largest number of actions on one object."""
+_BESIDE = 3
+"""Regions that are at most this many pixels apart touch each other."""
 _MOST_REMOVALS = 3
 """The largest number of objects that are taken out of one part of the kit."""
 _LEAST_SHARE = 0.5
@@ -154,14 +157,15 @@ class Inventory:
         """Whether the objects of a region were tried often enough. For None the result is False.
 
         `_MOST_TRIES` actions on one object are enough. A region that fits into no recess is not
-        tried once more if all objects that it can contain were laid there before.
+        tried once more if all objects that it can contain were laid there before and it touches no
+        other region, which may hide a part of it.
         """
         if region is None:
             return False
         fits_nowhere = self.pair_of(region) is None and not self.is_reversed(region)
         laid = sum(moves[-1].outcome == "placed" for moves in self._moves_of(region))
         if fits_nowhere and laid and not self._may_contain(region, laid + 1):
-            return True
+            return self._is_alone(region) or self.tries(region) >= _MOST_TRIES
         return self.tries(region) >= _MOST_TRIES
 
     def tries(self, region: Region) -> int:
@@ -267,6 +271,12 @@ class Inventory:
         areas = sorted((int(item.mask.sum()) for item in self.open_recesses), reverse=True)
         largest = areas[:count]
         return len(largest) == count and bool(region.mask.sum() >= _SEVERAL * sum(largest))
+
+    def _is_alone(self, region: Region) -> bool:
+        """Whether no other object touches a region."""
+        around = ndimage.binary_dilation(region.mask, iterations=_BESIDE)
+        others = (item for item in self.segmentation.objects if item is not region)
+        return not any((around & item.mask).any() for item in others)
 
     def _was_filled(self, recess: Region) -> bool:
         return any(

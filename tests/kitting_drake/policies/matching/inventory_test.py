@@ -135,6 +135,18 @@ def test_an_object_that_fits_is_tried_again_but_not_forever():
     assert policy(dataclasses.replace(alone, history=(missed,) * 3)).reason == "gave up"
 
 
+@pytest.mark.parametrize(("gap", "is_tried"), [(2, False), (8, True)])
+def test_an_object_that_was_laid_beside_another_is_tried_again(gap: int, is_tried: bool):
+    here, beside = np.zeros((2, *GRID.shape), bool)
+    here[60:74, 180:214] = True
+    beside[74 + gap : 88 + gap, 180:214] = True
+    laid = tuple(placed_at((row, 197.0)) for row in (67.0, 81.0 + gap))
+    seen = scene((here, 0.015), (beside, 0.015))
+    found = Inventory.of(dataclasses.replace(seen, history=laid))
+    assert len(found.segmentation.objects) == 2
+    assert [found.is_tried(item) for item in found.segmentation.objects] == [is_tried] * 2
+
+
 def test_two_actions_that_set_an_object_down_count_as_one():
     laid = placed_at((71.0, 200.0), pick=True, aside=False)
     missed, set_down = (dataclasses.replace(laid, outcome=o) for o in ("missed", "set down"))
