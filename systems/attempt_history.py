@@ -93,9 +93,9 @@ class AttemptHistory:
                 place,
                 press=bool(row.press),
                 aside=bool(row.aside),
-                middle=_known(row.middle),
+                middle=known_point(row.middle),
             )
-            balance = _known(row.balance)
+            balance = known_point(row.balance)
             outcome, top = OUTCOMES[int(row.outcome)], None if np.isnan(row.top) else row.top
             found.append(Attempt(action, outcome, row.peak_force, balance, top))
         return tuple(found)
@@ -119,7 +119,8 @@ class AttemptHistory:
         return int(np.count_nonzero(~np.isnan(self._rows[:, 0])))
 
 
-def _known(point: NDArray[np.float64]) -> tuple[float, float] | None:
+def known_point(point: NDArray[np.float64]) -> tuple[float, float] | None:
+    """Returns a stored point (2); None if it is NaN."""
     x, y = point.tolist()
     return None if np.isnan(x) else (x, y)
 

@@ -55,7 +55,8 @@ def lift_higher(state: PlannerState) -> bool:
     """Raises the heights of the way if the object hangs lower than they assume.
 
     Args:
-        state: the planner's state, at the end of `LIFT`; modified.
+        state: the planner's state, at the end of `LIFT` or while the hand still rises in `CARRY`;
+            modified.
 
     Returns:
         Whether the lift must go on.

@@ -14,7 +14,7 @@ from pydrake.systems.framework import (
     LeafSystem,
 )
 
-from systems.attempt_history import AttemptHistory, LeftOverVector
+from systems.attempt_history import AttemptHistory, LeftOverVector, known_point
 from systems.contact_guard import ContactGuard, known_payload
 from systems.floating_hand_motion import HandMotion
 from systems.hand_geometry import check_reach
@@ -117,7 +117,7 @@ class PickPlacePlanner(LeafSystem):
       than friction holds on the way (`slips_when_carried`), it is set down again. The history then
       contains the estimated centre of mass, so that a policy can grip the object there.
       An object that leaves the table late hangs lower than it lay, because it turned or another
-      object is caught in it; it is lifted and carried higher by as much (`hanging`).
+      object is caught in it; it is lifted and carried higher by half as much again (`hanging`).
     - `RELEASE`: if the jaws stick to the object, they open with force.
     - `SEARCH`: in tasks that insert objects into cavities, if the object stands on the rim around
       its place, the hand searches for the cavity. When the resistance ends, it lowers the object
@@ -367,9 +367,7 @@ def _action_of(state: PlannerState) -> PickPlaceAction:
         reason=list(STOP_REASONS)[int(state.stop) - 1] if state.stop else "",
         press=bool(state.press),
         aside=bool(state.aside),
-        middle=None
-        if np.isnan(state.middle[0])
-        else (float(state.middle[0]), float(state.middle[1])),
+        middle=known_point(state.middle),
     )
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -185,6 +185,23 @@ def rotation_matrix(angle: float) -> NDArray[np.float64]:
     radians."""
     cos, sin = math.cos(angle), math.sin(angle)
     return np.array([[cos, -sin], [sin, cos]])
+
+
+def moved_pixels(
+    pixels: NDArray[Any],
+    pick: NDArray[np.float64],
+    rotation: float,
+    place: NDArray[np.float64],
+) -> NDArray[np.int_]:
+    """Returns where an object's pixels (n, 2) come to lie, rounded; they may be outside the image.
+
+    Args:
+        pixels: row and column of each pixel.
+        pick: (row, col) at which the object is gripped.
+        rotation: the rotation of the object, in radians.
+        place: (row, col) to which the gripped point goes.
+    """
+    return np.rint(place + (pixels - pick) @ rotation_matrix(rotation).T).astype(int)
 
 
 def crop(image: Image, centre: tuple[int, int], side: int) -> Image:

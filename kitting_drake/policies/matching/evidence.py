@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from kitting_drake.policies.data.images import rotation_matrix
+from kitting_drake.policies.data.images import moved_pixels, rotation_matrix
 from kitting_drake.policies.matching.refinement import nearest_region
 from kitting_drake.policies.matching.regions.segmentation import Region, Segmentation
 from kitting_drake.policies.matching.registration import Registration, fit_quality, trace_outline
@@ -70,7 +70,7 @@ def geometric_evidence(
     if region is None:
         return evidence
     rows, cols = seen.shape
-    there = np.rint(place + (region.pixels - pick) @ rotation_matrix(rotation).T).astype(int)
+    there = moved_pixels(region.pixels, pick, rotation, place)
     inside = ((there >= 0) & (there < (rows, cols))).all(axis=1)
     target = np.zeros_like(seen)
     target[tuple(there[inside].T)] = True

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from kitting_drake.policies.data.images import rotation_matrix
+from kitting_drake.policies.data.images import moved_pixels
 from kitting_drake.policies.matching.assignment import Pair, match, reversed_objects
 from kitting_drake.policies.matching.refinement import nearest_region
 from kitting_drake.policies.matching.regions.segmentation import Region, Segmentation, segment
@@ -196,7 +196,7 @@ class Inventory:
         region = nearest_region(self.segmentation.objects, pick)
         if region is None:
             return False
-        target = np.rint(place + (region.pixels - pick) @ rotation_matrix(turn).T).astype(int)
+        target = moved_pixels(region.pixels, pick, turn, place)
         target = target[((target >= 0) & (target < grid.shape)).all(axis=1)]
         mask = mask_of(self.segmentation.protruding, grid.shape)
         return bool(mask[tuple(target.T)].sum() > _OBSTRUCTED * len(region.pixels))

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from kitting_drake.policies.data.images import rotation_matrix
+from kitting_drake.policies.data.images import moved_pixels
 from systems.hand_geometry import FINGERTIP_DEPTH, PAD_LENGTH
 from systems.signals import Observation, PixelGrid
 
@@ -114,7 +114,7 @@ class Visibility:
             reach = np.arange(-_BLIND, _BLIND + self.resolution, self.resolution) / self.resolution
             disc = np.stack(np.meshgrid(reach, reach, indexing="ij"), axis=-1).reshape(-1, 2)
             footprint = pick + disc[np.linalg.norm(disc, axis=1) * self.resolution <= _BLIND]
-        there = np.rint(place + (footprint - pick) @ rotation_matrix(rotation).T).astype(int)
+        there = moved_pixels(footprint, pick, rotation, place)
         rows, cols = self.seen.shape
         within = ((there >= 0) & (there < (rows, cols))).all(axis=1)
         if within.mean() < _INSIDE:
