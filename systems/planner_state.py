@@ -63,8 +63,8 @@ class PlannerState(VectorView):
     held_width = Number()
     """The opening of the jaws just after they gripped the object, in m."""
     steady_weight = Number()
-    """The weight that the hand felt as it rose, in N, when it changed last. `steady_z` is the height
-    of the fingertips then. `latest_weight` is the weight felt in the latest step."""
+    """The weight that the hand felt as it rose, in N, when it changed last. `steady_z` is the
+    height of the fingertips then. `latest_weight` is the weight felt in the latest step."""
     latest_weight = Number()
     steady_z = Number()
     hanging = Number()
