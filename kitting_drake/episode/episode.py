@@ -10,8 +10,10 @@ from typing import Any
 from pydrake.systems.framework import Context, Diagram, EventStatus
 
 from kitting_drake.episode.action_log import ActionLog
+from kitting_drake.episode.arm_use import ArmUse, ArmUseMeter
 from kitting_drake.episode.ending import Remainder, find_left_over, is_right
 from kitting_drake.episode.events import EpisodeObserver, ModeChange, Sampler
+from kitting_drake.scenario.robots import FrankaArm
 from kitting_drake.station import KittingStation
 from kitting_drake.tasks.task import ActionRecord
 from systems.pick_place_parameters import Mode
@@ -89,6 +91,8 @@ class EpisodeResult:
     judged."""
     left_over: Remainder = dataclasses.field(default_factory=Remainder)
     """Objects that are not placed and cavities that are not filled."""
+    arm: ArmUse | None = None
+    """How much of its limits the arm used, and what its links touched; None for a floating hand."""
 
     def as_dict(self) -> dict[str, Any]:
         """Returns the result as plain values for JSON."""
@@ -158,7 +162,10 @@ class Episode:
         self._names = {"scenario": scenario, "policy": policy, "seed": station.seed}
         self._log = ActionLog(station)
         told = [self._log.observe, *observers]
-        self._monitor = _Monitor(station, told, log, pauses=pauses)
+        has_arm = isinstance(station.scenario.robot, FrankaArm)
+        self._arm = ArmUseMeter(station) if has_arm else None
+        samplers = [it for it in (self._arm, log) if it is not None]
+        self._monitor = _Monitor(station, told, samplers, pauses=pauses)
         self._simulator = station.make_simulator(diagram, monitor=self._monitor.step)
         self._simulator.set_target_realtime_rate(realtime_rate)
         self._failure: str | None = None
@@ -241,6 +248,7 @@ class Episode:
             stop_reason=reason,
             stop_reason_right=is_right(reason, station, context),
             left_over=find_left_over(station, context),
+            arm=None if self._arm is None else self._arm.result(),
         )
 
     def _stop_reason(self) -> str:
@@ -316,12 +324,12 @@ class _Monitor:
         self,
         station: KittingStation,
         observers: Sequence[EpisodeObserver],
-        log: Sampler | None,
+        samplers: Sequence[Sampler],
         *,
         pauses: bool,
     ) -> None:
         self._station = station
-        self._log = log
+        self._samplers = samplers
         self._pauses = pauses
         self._end_at_success = station.scenario.end_at_success and not pauses
         self.is_paused = False
@@ -334,8 +342,8 @@ class _Monitor:
         """Notifies the observers after a step, and decides whether the episode ends or pauses."""
         station = self._station
         self.tell(root_context)
-        if self._log is not None:
-            self._log.sample(root_context)
+        for sampler in self._samplers:
+            sampler.sample(root_context)
         if self._pauses or self._end_at_success:
             asks = station.asks(root_context)
             if asks and self._end_at_success and station.reward(root_context) > ALL:

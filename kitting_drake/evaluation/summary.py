@@ -119,6 +119,7 @@ def summarise(
         "dropped_objects": sum(episode["dropped_objects"] for episode in episodes),
         "stopped_actions": sum(episode.get("stopped_actions", 0) for episode in episodes),
         "peak_force_n": _describe(peak_forces(episodes), "force"),
+        "arm": _arm_use([episode["arm"] for episode in episodes if episode.get("arm")]),
         "moving_at_end": sum(len(episode["moving_at_end"]) for episode in episodes),
         "point_contact_pairs": max(episode["point_contact_pairs"] for episode in episodes),
         "sim_seconds": sum(episode["sim_seconds"] for episode in episodes),
@@ -148,6 +149,16 @@ def _stop_reasons(episodes: Sequence[Episode]) -> dict[str, dict[str, int]]:
             counts = found.setdefault(episode["stop_reason"], {"right": 0, "wrong": 0})
             counts["right" if verdict else "wrong"] += 1
     return found
+
+
+def _arm_use(uses: Sequence[Entry]) -> dict[str, Any] | None:
+    """The largest share of each limit that the arm used in any episode, and the number of episodes
+    in which each pair of bodies collided; None without an arm. See `ArmUse`."""
+    if not uses:
+        return None
+    collisions = Counter(pair for use in uses for pair in use["collisions"])
+    shares = {key: max(use[key] for use in uses) for key in uses[0] if key != "collisions"}
+    return {**shares, "collisions": dict(collisions)}
 
 
 def peak_forces(episodes: Sequence[Episode]) -> list[Entry]:

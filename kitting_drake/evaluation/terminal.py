@@ -188,6 +188,8 @@ def summary_notes(summary: dict[str, Any]) -> str:
         f"peak force of an action: 95 % below {number(peak['p95'], '.0f')} N, "
         f"at most {number(peak['max'], '.0f')} N; {summary['stopped_actions']} stopped"
     )
+    if summary["arm"]:
+        lines.append(_arm_line(summary["arm"]))
     if summary["needless_actions"]:
         lines.append(
             f"actions on objects that have no goal: {summary['needless_actions']} of "
@@ -196,6 +198,13 @@ def summary_notes(summary: dict[str, Any]) -> str:
     if summary["moving_at_end"]:
         lines.append(f"still moving at the end: {summary['moving_at_end']} objects")
     return "\n".join(lines)
+
+
+def _arm_line(use: dict[str, Any]) -> str:
+    """A line with the shares of an arm's limits that were used, and the collisions of its links."""
+    shares = [f"{key} {share:.0%}" for key, share in use.items() if key != "collisions"]
+    pairs = [f"{pair} ({count})" for pair, count in use["collisions"].items()]
+    return f"arm, of its limits: {', '.join(shares)}; collisions: {', '.join(pairs) or 'none'}"
 
 
 def number(value: float | None, form: str = ".2f") -> str:

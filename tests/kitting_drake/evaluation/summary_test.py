@@ -194,3 +194,15 @@ def test_summary_of_failed_episodes_only():
     assert summary["add_s_mm"]["median"] is None
     assert list(summary["categories"]) == ["unknown"]
     assert summary["causes"]["failed episode"] == 1
+
+
+def test_an_arms_limits_and_collisions_over_all_episodes():
+    shares = {"position": 0.5, "velocity": 0.9, "acceleration": 1.0, "jerk": 0.1, "torque": 0.3}
+    uses = [
+        {**shares, "collisions": []},
+        {**shares, "torque": 0.4, "collisions": ["link6 and kit"]},
+    ]
+    episodes = [make_episode(seed, [1.0]) | {"arm": use} for seed, use in enumerate(uses)]
+    found = summarised(episodes)["arm"]
+    assert found == {**shares, "torque": 0.4, "collisions": {"link6 and kit": 1}}
+    assert summarised([make_episode(0, [1.0])])["arm"] is None
