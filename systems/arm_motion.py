@@ -36,6 +36,8 @@ _SAME_HEIGHT = 0.003
 _HELD_REACH = 0.125
 """A held object reaches at most this far from the fingertips, in m. `read_surface_heights` assumes
 the same."""
+_TOO_LOW = 0.010
+"""A motion on which the hand sinks below the clear height by more than this, in m, is not begun."""
 _TOUCH_SPEED = 0.011
 """Upper limit of `touch_speed` for an arm, in m/s. The force of an impact is proportional to mass
 times speed. The mass that moves with an arm's hand is 10 to 25 kg; with the floating hand it is 4
@@ -180,6 +182,8 @@ class ArmMotion(JawMotion):
             touched = self.postures.collision(way.positions(), surface, held)
             if touched:
                 return f"on the way to the {name} the arm would collide with {touched}"
+            if way.missing > _TOO_LOW:
+                return f"on the way to the {name} the hand would sink into what lies there"
         return ""
 
     def begin(

@@ -14,6 +14,7 @@ from systems.arm_collisions import Capsule, collision
 from systems.arm_kinematics import (
     HAND_TURN,
     ArmBase,
+    fingertips,
     hand_state,
     inverse,
     joint_seven,
@@ -31,6 +32,13 @@ _CHECKED = 12
 """Number of points of a path that are checked for collisions."""
 _JUMP = 1.5
 """Largest allowed change of a joint while the hand moves straight up or down, in rad."""
+_SHARES = np.array([0.0, 0.25, 0.5, 0.75, 0.9, 1.0])[:, None, None]
+"""The points at which a straight line in joint space is examined. Near its end, where the hand is
+low, they are closer."""
+_PER_METRE = 30.0
+"""A way on which the fingertips sink by a metre between its ends counts as slower by this, in s."""
+_DEEPEST = 0.02
+"""If possible, the fingertips sink by at most this between the ends of a way, in m."""
 _TILTS = (math.radians(2.0), math.radians(20.0), math.pi)
 """Limits of the hand's tilt between two stops, in rad. The smallest limit that allows a motion is
 used: if the hand tilts, one end of a long object hangs lower."""
@@ -197,7 +205,9 @@ class ArmPostures:
         tilt: float,
     ) -> tuple[float, list[NDArray[np.float64]]] | None:
         """Returns the time, in s, and the postures of the fastest way to a posture. Returns None if
-        each way would tilt the hand too far while it may hold an object.
+        each way would tilt the hand too far while it may hold an object, or let it sink too far.
+
+        A way on which the hand sinks counts as slower, because it must be led higher.
 
         Args:
             q: (7) the posture.
@@ -206,8 +216,13 @@ class ArmPostures:
         """
         starts = np.array([way[-1] for _, way in ways])
         times = np.array([time for time, _ in ways]) + self._times(starts, q)
+        line = starts + _SHARES * (q - starts)
+        sinks = _sinks(line)
+        times += _PER_METRE * sinks
+        if tilt < math.pi:
+            times[sinks > _DEEPEST] = np.inf
         if len(ways[0][1]) > 1:
-            times[_tilts(starts, q) > tilt] = np.inf
+            times[_tilts(line) > tilt] = np.inf
         best = int(np.argmin(times))
         return (float(times[best]), [*ways[best][1], q]) if np.isfinite(times[best]) else None
 
@@ -298,12 +313,17 @@ class ArmPostures:
         return f"{where} is out of the arm's reach at heights {heights}"
 
 
-def _tilts(starts: NDArray[np.float64], end: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(n) the hand's largest tilt, in rad, on the straight line in joint space from each of the
-    postures `starts` (n, 7) to the posture `end`."""
-    share = np.array([0.25, 0.5, 0.75])[:, None, None]
-    least = uprightness(starts + share * (end - starts)).min(0)
-    return np.asarray(np.arccos(np.clip(least, -1.0, 1.0)))
+def _tilts(lines: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n) the hand's largest tilt, in rad, on n lines in joint space, whose postures are (k, n,
+    7)."""
+    return np.asarray(np.arccos(np.clip(uprightness(lines).min(0), -1.0, 1.0)))
+
+
+def _sinks(lines: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n) how far, in m, the fingertips sink below both ends of n lines in joint space, whose
+    postures are (k, n, 7)."""
+    heights = fingertips(lines)[..., 2]
+    return np.maximum(np.minimum(heights[0], heights[-1]) - heights.min(0), 0.0)
 
 
 def _wrap(angle: NDArray[np.float64]) -> NDArray[np.float64]:

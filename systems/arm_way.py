@@ -34,6 +34,8 @@ _TRIES, _PATIENCE = 8, 3
 _ANY_ACCELERATION = 1e3
 """Acceleration of the yaw on a straight line, in rad/s^2. It is so large that only the joints'
 limits matter."""
+_TOO_LOW = 0.001
+"""If a path sinks below the clear height by more than this, in m, a higher one is tried."""
 _NEARLY_THERE = 0.02
 """Within this horizontal distance of the path's end, in m, the hand may sink below the clear
 height."""
@@ -112,6 +114,9 @@ class ArmWay:
         q, v, a = way.start.reshape(3, -1)
         self._stop = ArmStop(q, v, a, self._limits, inertia)
         self._stopping, self._rest = self._stop.duration, self._stop.goal
+        self.missing = 0.0
+        """How far, in m, the hand or the held object sinks below the clear height on an `over`
+        path, where it should stay above."""
         self._motion = self._plan(way, self._rest)
         self.duration = self._stopping + (self._motion.duration if self._motion else 0.0)
         self._accelerations = self._hand_accelerations()
@@ -221,24 +226,23 @@ class ArmWay:
         end = self._postures.hand_pose(over)
         single = self._postures.hand_pose(q)[2] >= way.clear or way.sink >= way.clear
         rounding = _WIDER if single else _ROUNDING
-        raised = 0.0
-        path = None
+        raised, found = 0.0, []
         for attempt in range(_TRIES):
-            pieces = [self._up(q, way.clear + raised)]
+            up = self._up(q, way.clear + raised)
             down = self._down(over, end, max(way.clear + raised, way.sink), way.sink)
-            path = self._evenly(np.concatenate([*pieces, down]), rounding)
+            path = self._evenly(np.concatenate([up, down]), rounding)
             if path is None:
-                break
+                # The path has no length, so the arm stays where it is.
+                points = np.repeat(q[None], 3, axis=0)
+                return _Path(points, self._postures.base.to_world(fingertips(points)))
             missing = self._missing(path, float(way.clear), float(way.reach))
-            if missing <= 0.001:
-                return path
+            found.append((missing, path))
+            if missing <= _TOO_LOW:
+                break
             # Near a rounded corner a little more height may not help, so later tries raise the path
             # by more.
             raised += (missing + 0.005) * 2 ** max(attempt - _PATIENCE, 0)
-        if path is None:
-            # The path has no length, so the arm stays where it is.
-            points = np.repeat(q[None], 3, axis=0)
-            return _Path(points, self._postures.base.to_world(fingertips(points)))
+        self.missing, path = min(found, key=lambda pair: pair[0])
         return path
 
     def _up(self, q: NDArray[np.float64], height: float) -> NDArray[np.float64]:

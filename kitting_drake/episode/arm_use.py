@@ -16,6 +16,7 @@ from kitting_drake.scenario.robots import FrankaArm
 from kitting_drake.station import KittingStation
 from kitting_drake.station.robot import ARM, HAND
 from systems.arm_limits import ARM_LIMITS, JOINTS
+from systems.arm_trajectory import limits_used
 
 _PALM = "hand"
 """Name of the hand's body that carries the fingers."""
@@ -29,7 +30,7 @@ class ArmUse:
     """
 
     position: float = 0.0
-    """Distance from the middle of a joint's range, commanded or measured; its limit is half of the
+    """Distance from the middle of a joint's range, commanded or measured; its limit is half the
     range."""
     velocity: float = 0.0
     """Commanded velocity. Limits that depend on the position are taken at the commanded one."""
@@ -80,24 +81,16 @@ class ArmUseMeter:
     def result(self) -> ArmUse:
         """The largest shares and all collisions so far."""
         samples = np.array(self._samples).reshape(-1, 1 + 5 * JOINTS)
-        q, v, a, measured, torque = samples[:, 1:].reshape(-1, 5, JOINTS).swapaxes(0, 1)
+        # After a pause, the first sample is a repetition.
+        samples = samples[np.unique(samples[:, 0], return_index=True)[1], 1:]
+        desired, measured, torque = np.split(samples, [3 * JOINTS, 4 * JOINTS], axis=1)
         limits = self._limits
         lower, upper = np.array(limits.lower), np.array(limits.upper)
-        slowest, fastest = limits.velocity_bounds(q)
-        # A step of zero length is the second call at one time.
-        steps = np.diff(samples[:, :1], axis=0)
-        moved = steps[:, 0] > 0
-        jerk = np.diff(a, axis=0)[moved] / steps[moved]
-        shares = {
-            "position": abs(np.concatenate([q, measured]) - (lower + upper) / 2)
-            / ((upper - lower) / 2),
-            "velocity": np.maximum(v, 0) / fastest + np.minimum(v, 0) / slowest,
-            "acceleration": abs(a) / limits.acceleration,
-            "jerk": abs(jerk) / limits.jerk,
-            "torque": abs(torque) / limits.torque,
-        }
+        shares = dict(limits_used(desired, limits, 1 / self._station.plant.time_step()))
+        away = abs(2 * (measured - lower) / (upper - lower) - 1).max(initial=0)
         return ArmUse(
-            **{key: float(share.max(initial=0)) for key, share in shares.items()},
+            **shares | {"position": max(shares["position"], float(away))},
+            torque=float((abs(torque) / limits.torque).max(initial=0)),
             collisions=list(self._collisions),
         )
 

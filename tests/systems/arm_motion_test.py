@@ -159,6 +159,8 @@ def test_the_hand_s_acceleration_is_that_of_the_joints():
         ((0.39, 0.31, 1.44), (0.37, -0.13, 1.48), False),
         # Here the hand must also tilt during LIFT, by up to 46 degrees.
         ((0.348, 0.008, 1.396), (0.719, -0.166, -1.358), True),
+        # Here the fastest postures would let the hand sink on its way to the pick, by 29 mm.
+        ((0.353, 0.092, -1.855), (0.641, -0.204, 0.446), True),
     ],
 )
 def test_where_the_arm_leaves_its_vertical_plane_the_hand_clears_everything(
