@@ -33,6 +33,10 @@ from systems.signals import (
 from systems.surface_heights import read_surface_heights
 from systems.weak_calc import weak_calc
 
+_ASIDE = 0.05
+"""An object to be laid aside is lowered slowly from this much higher, in m, because it may hang
+aslant: it leaned on others or lay in a heap."""
+
 
 class PickPlacePlanner(LeafSystem):
     """Executes one pick and place after another.
@@ -322,6 +326,9 @@ class PickPlacePlanner(LeafSystem):
         if action.press:
             action = dataclasses.replace(action, place=action.pick)
         self._set_heights(state, self._heights(context, action))
+        if action.aside:
+            hover = float(state.place_hover_z)
+            state.place_hover_z = max(hover, min(hover + _ASIDE, float(state.travel_z)))
         state.search_step, state.press, state.aside = 0, action.press, action.aside
         state.middle = np.nan if action.middle is None else action.middle
         state.stops = state.doubts_grip = 0

@@ -867,3 +867,20 @@ def test_the_hand_slows_down_where_contact_is_expected():
     assert max(slow.values()) <= PARAMETERS.touch_speed + 1e-6
     assert max(on_the_way) <= PARAMETERS.contact_speed + 1e-6
     assert max(speeds.values()) > 2 * PARAMETERS.contact_speed
+
+
+def test_what_is_laid_aside_is_lowered_slowly_from_higher_up():
+    heights = dataclasses.replace(HEIGHTS, highest=0.2)
+    starts = {}
+    for aside in (False, True):
+        answer = dataclasses.replace(ACTION, heights=heights, aside=aside)
+        run = Run(answer=answer).until(Mode.LOWER)
+        starts[aside] = run.output("desired_motion")[2]
+    assert starts[True] == pytest.approx(starts[False] + 0.05, abs=1e-3)
+    slow = []
+    while run.sequence[-1] == Mode.LOWER:
+        z, vz = run.output("desired_motion")[[2, 6]]
+        slow += [-vz] if z < starts[True] - PARAMETERS.hover_clearance else []
+        run.simulator.AdvanceTo(run.simulator.get_context().get_time() + 1 / 128)
+    assert len(slow) > 50
+    assert max(slow) <= PARAMETERS.contact_speed + 1e-6
