@@ -14,6 +14,7 @@ from scipy import ndimage
 from kitting_drake.policies.data.images import moved_pixels
 from kitting_drake.policies.matching.assignment import Pair, match, reversed_objects
 from kitting_drake.policies.matching.refinement import nearest_region
+from kitting_drake.policies.matching.regions.fixtures import CLEAN
 from kitting_drake.policies.matching.regions.segmentation import Region, Segmentation, segment
 from kitting_drake.policies.matching.splitting import split_touching
 from systems.signals import Attempt, LeftOver, Observation, PickPlaceAction, PlanarPose
@@ -89,7 +90,25 @@ class Inventory:
         """The free recesses into which no object is known to fit."""
         recesses = self.segmentation.recesses
         known = {id(recesses[pair.recess]) for pair in self.pairs}
-        return tuple(item for item in self.segmentation.free_recesses if id(item) not in known)
+        return tuple(item for item in self.free_recesses if id(item) not in known)
+
+    @cached_property
+    def free_recesses(self) -> tuple[Region, ...]:
+        """The recesses that seem free, except those into which an object was placed.
+
+        A flat tool in its recess looks like the recess's floor, and so does any tool if there is
+        noise. But without noise, if an object is loose, what seems free is free; and so is a recess
+        into which a loose object fits.
+        """
+        seen = self.segmentation
+        if seen.noise <= CLEAN and seen.objects:
+            return seen.free_recesses
+        wanted = {id(seen.recesses[pair.recess]) for pair in self.matches}
+        moved = ([it for it in moves if it.outcome != "pressed"] for moves in self._moves)
+        last = [moves[-1] for moves in moved if moves]
+        placed = [it.action for it in last if it.outcome == "placed" and not it.action.aside]
+        filled = {id(self._recess_at(action.place)) for action in placed} - wanted
+        return tuple(item for item in seen.free_recesses if id(item) not in filled)
 
     @property
     def strangers(self) -> tuple[Region, ...]:
@@ -117,17 +136,11 @@ class Inventory:
 
     @property
     def left_over(self) -> LeftOver:
-        """The objects that are not in a recess, and the recesses that are free.
-
-        A flat tool in its recess looks like the floor of the recess. So if no object is loose, a
-        recess into which an object was placed counts as filled.
-        """
+        """The objects that are not in a recess, and the recesses that are free."""
         seen = self.segmentation
-        loose = (*seen.objects, *seen.protruding)
-        free = [item for item in seen.free_recesses if loose or not self._was_filled(item)]
         return LeftOver(
-            objects=tuple(self._middle(item) for item in loose),
-            cavities=tuple(self._middle(item) for item in free),
+            objects=tuple(self._middle(item) for item in (*seen.objects, *seen.protruding)),
+            cavities=tuple(self._middle(item) for item in self.free_recesses),
         )
 
     @property
@@ -140,9 +153,9 @@ class Inventory:
         if not seen.objects and not seen.protruding:
             return "done"
         tried = any(self.tries(item) for item in (*seen.objects, *seen.protruding))
-        if (seen.free_recesses or seen.protruding) and tried:
+        if (self.free_recesses or seen.protruding) and tried:
             return "gave up"
-        return "nothing fits" if seen.objects and seen.free_recesses else "done"
+        return "nothing fits" if seen.objects and self.free_recesses else "done"
 
     def pair_of(self, region: Region) -> Pair | None:
         """Returns the pair of an object and its recess; None if the object fits into no recess."""
@@ -278,12 +291,12 @@ class Inventory:
         others = (item for item in self.segmentation.objects if item is not region)
         return not any((around & item.mask).any() for item in others)
 
-    def _was_filled(self, recess: Region) -> bool:
-        return any(
-            self._is_there(attempt.action.place, recess)
-            for attempt in self._history
-            if attempt.outcome == "placed" and not attempt.action.aside
-        )
+    def _recess_at(self, place: PlanarPose) -> Region | None:
+        """Returns the recess into which an action placed its object; None if it placed it
+        elsewhere."""
+        pixel = np.array(self.observation.grid.to_pixel((place.x, place.y)))
+        region = nearest_region(self.segmentation.recesses, pixel)
+        return region if region is not None and self._is_there(place, region) else None
 
     @property
     def _has_filled(self) -> bool:

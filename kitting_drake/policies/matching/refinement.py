@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from kitting_drake.policies.data.images import rotation_matrix
 from kitting_drake.policies.matching.assignment import Pair
@@ -180,13 +181,26 @@ def _better_elsewhere(
 
 
 def nearest_region(regions: tuple[Region, ...], pixel: Array) -> Region | None:
-    """Returns the region nearest to a position (row, col); None if all are farther than `_NEAR`."""
+    """Returns the region nearest to a position (row, col); None if all are farther than `_NEAR`. A
+    region's holes belong to it: jaws that grip a ring from outside are centred on its hole."""
     best, least = None, _NEAR
     for region in regions:
         distance = float(np.linalg.norm(region.pixels - pixel, axis=1).min())
+        if distance >= 1 and _encloses(region, pixel):
+            distance = 0.0
         if distance < least:
             best, least = region, distance
     return best
+
+
+def _encloses(region: Region, pixel: Array) -> bool:
+    """Whether a position (row, col) lies in a hole of a region."""
+    row, col = np.rint(pixel).astype(int)
+    rows, cols = region.pixels.T
+    if not (rows.min() < row < rows.max() and cols.min() < col < cols.max()):
+        return False
+    part = region.mask[rows.min() : rows.max() + 1, cols.min() : cols.max() + 1]
+    return bool(ndimage.binary_fill_holes(part)[row - rows.min(), col - cols.min()])
 
 
 @dataclass(frozen=True)

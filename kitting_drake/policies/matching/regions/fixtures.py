@@ -47,6 +47,9 @@ CLEAN = 0.0005
 """Heights are filtered only if the standard deviation of their noise exceeds this, in metres."""
 _LEVEL = math.tan(math.radians(0.7))
 """The slope below which a plateau counts as level."""
+_REWEIGHTED, _SAME_HEIGHT = 8, 0.0003
+"""The number of reweighted fits of a fixture's top, and the deviation, in metres, below which a
+pixel's weight no longer grows."""
 _TILT_ROUNDS = 3
 """The number of rounds in which a tilted plateau is extended along its slope."""
 NEIGHBOURS = np.ones((3, 3), bool)
@@ -93,6 +96,21 @@ def _fit_plane(height: NDArray[np.float32], start: float, where: Mask) -> Plane:
         if near.sum() < 100:
             break
         plane = np.linalg.lstsq(design[near], values[near], rcond=None)[0]
+    return plane
+
+
+def _fit_top(height: NDArray[np.float32], plateau: Mask) -> Plane:
+    """Fits a plane to a fixture's top. Shallow recesses and the tops of seated objects may lie
+    within `PLANE_BAND` of it, so the fit minimizes absolute deviations."""
+    plane = _fit_plane(height, float(np.median(height[plateau])), plateau)
+    rows, cols = np.nonzero(plateau)
+    design = np.column_stack([rows, cols, np.ones(len(rows))])
+    values = height[rows, cols].astype(float)
+    for _ in range(_REWEIGHTED):
+        away = np.abs(values - design @ plane)
+        weights = (away < PLANE_BAND) / np.maximum(away, _SAME_HEIGHT)
+        weighted = design * weights[:, None]
+        plane = np.linalg.solve(weighted.T @ design, weighted.T @ values)
     return plane
 
 
@@ -176,15 +194,14 @@ def _find_fixture(
     fixture = np.ones(height.shape, bool)
     for a, b, offset in hull.equations:
         fixture &= a * rows + b * cols + offset <= 0.5
-    start = float(np.median(height[plateau]))
-    return fixture, _fit_plane(height, start, plateau)
+    return fixture, _fit_top(height, plateau)
 
 
 def _along_tilt(plateau: Mask, height: NDArray[np.float32], high: Mask, resolution: float) -> Mask:
     """Extends a level band of a tilted plateau to the whole plateau. Returns a level plateau
     unchanged."""
     for _ in range(_TILT_ROUNDS):
-        plane = _fit_plane(height, float(np.median(height[plateau])), plateau)
+        plane = _fit_top(height, plateau)
         if math.hypot(plane[0], plane[1]) < _LEVEL * resolution:
             return plateau
         near = high & (np.abs(height - plane_heights(plane, height.shape)) < PLANE_BAND)

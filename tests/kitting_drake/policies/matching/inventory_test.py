@@ -238,3 +238,22 @@ def test_an_object_on_its_wrong_face_is_turned_over_the_block_s_edge():
     assert min(abs(row - 19.5), abs(row - 109.5), abs(col - 19.5), abs(col - 109.5)) < 8
     assert ShapeMatchingPolicy(PLANNER)(wrong).reason == "nothing fits"
     assert ShapeMatchingPolicy(PLANNER, recover=True)(wrong).poses == action.poses
+
+
+def noisy(observation: Observation, deviation: float = 0.0015) -> Observation:
+    image = observation.image.copy()
+    image[3] += np.random.default_rng(0).normal(0.0, deviation, GRID.shape).astype(np.float32)
+    return dataclasses.replace(observation, image=image)
+
+
+def test_with_noise_a_recess_that_was_filled_is_not_worth_a_try():
+    """With noise, an object that lies low in its recess looks like the recess's floor."""
+    box = np.zeros(GRID.shape, bool)
+    box[60:72, 180:215] = True
+    seen = noisy(scene((box, 0.015)))
+    assert len(Inventory.of(seen).worth_a_try) == 1
+    places = [placed_at(pixel, aside=False) for pixel in ((42.0, 60.0), (78.0, 60.0))]
+    found = Inventory.of(dataclasses.replace(seen, history=tuple(places)))
+    assert len(found.segmentation.free_recesses) == 2
+    assert not found.free_recesses and not found.worth_a_try
+    assert found.why_stop == "done"

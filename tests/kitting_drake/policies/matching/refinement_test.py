@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from kitting_drake.policies.matching.jaw_clearance import jaw_grasps
-from kitting_drake.policies.matching.refinement import refine_grasp
-from kitting_drake.policies.matching.regions.segmentation import Segmentation, segment
+from kitting_drake.policies.matching.refinement import nearest_region, refine_grasp
+from kitting_drake.policies.matching.regions.segmentation import Region, Segmentation, segment
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import Observation, PixelGrid
 
@@ -55,3 +55,12 @@ def test_a_grasp_goes_to_the_centre_of_mass_that_the_hand_has_felt():
     grasp = refine_grasp(found, pick, 0.0, GRID.resolution, PLANNER, balance=felt)
     assert grasp is not None
     assert np.linalg.norm(grasp.pick - felt) * GRID.resolution < 0.008
+
+
+def test_the_middle_of_a_ring_belongs_to_the_ring():
+    """Jaws that grip a ring from outside are centred on its hole."""
+    rows, cols = np.indices(GRID.shape)
+    away = np.hypot(rows - 60, cols - 100)
+    ring = Region((away > 8) & (away < 14), 0.02)
+    assert nearest_region((ring,), np.array([60.4, 100.2])) is ring
+    assert nearest_region((ring,), np.array([60.0, 122.0])) is None

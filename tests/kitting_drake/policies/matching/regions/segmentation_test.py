@@ -48,3 +48,18 @@ def test_parts_of_one_square_centimetre_are_seen_and_noise_is_not():
             image = np.full((4, *grid.shape), 0.5, np.float32)
             image[3] = np.maximum(true + noise * field / field.std(), 0)
             assert len(segment(Observation(image, grid)).objects) == expected
+
+
+def test_a_shallow_recess_does_not_tilt_the_top_of_its_fixture():
+    """A recess 3.5 mm deep on one side of the block lies within the band in which the top is
+    fitted."""
+    height = np.zeros(GRID.shape, np.float32)
+    height[40:100, 40:120] = 0.05
+    height[52:88, 45:70] = 0.0465
+    height[60:80, 90:110] = 0.03
+    image = np.full((4, *GRID.shape), 0.5, np.float32)
+    image[3] = height
+    found = segment(Observation(image, GRID))
+    depths = sorted(item.height for item in found.free_recesses)
+    assert depths == pytest.approx([0.0035, 0.02], abs=2e-4)
+    assert np.abs(found.depth[52:88, 45:70] - 0.0035).max() < 3e-4
