@@ -79,13 +79,17 @@ def is_right(reason: str, station: KittingStation, root_context: Context) -> boo
     """Whether the reason for stopping is right, judged by the true state.
 
     Something is left to do if an unfilled goal accepts an object that lies in the cell and fills no
-    goal. Whether a goal is filled is decided by the task's measure of success.
+    goal.
 
     - `done`: right if nothing is left to do.
     - `nothing fits`: right if an object or a goal is left, but no object fits an unfilled goal.
     - All others (`gave up`, `not sure`, `not seen`, `no kit seen`, `actions spent`, `time`,
       `failure`): right if something is left to do. `actions spent` is also right if the last
       action filled the last goal, because the policy is not asked again.
+
+    Whether a goal is filled is decided by the task's measure of success for `done` and `nothing
+    fits`, and by strict success for the others. So an object that protrudes, which the task's
+    measure may tolerate, is a right reason to give up.
 
     Args:
         reason: a value of `stop_reason`.
@@ -97,7 +101,7 @@ def is_right(reason: str, station: KittingStation, root_context: Context) -> boo
     """
     if reason in _UNJUDGED:
         return None
-    loose, free = _loose_and_free(station, root_context)
+    loose, free = _loose_and_free(station, root_context, strict=reason not in _NOTHING_TO_DO)
     goals = station.scene.goals
     is_left = any(index in goals[goal].objects for goal in free for index in loose)
     if reason == "actions spent" and not free:
@@ -108,18 +112,25 @@ def is_right(reason: str, station: KittingStation, root_context: Context) -> boo
     return not is_left and (reason == "done" or bool(loose or free))
 
 
-def _loose_and_free(station: KittingStation, root_context: Context) -> tuple[list[int], list[int]]:
+def _loose_and_free(
+    station: KittingStation, root_context: Context, *, strict: bool = False
+) -> tuple[list[int], list[int]]:
     """The indices of the objects in the cell that fill no goal, and of the goals that are not
-    filled."""
+    filled.
+
+    Args:
+        station: the station of the episode.
+        root_context: the root context of the outermost Diagram.
+        strict: whether only strict successes fill a goal.
+    """
     placements = station.placements(root_context)
     kept = station.kept_goals(root_context)
-    filled = {item.goal for item in placements if item.success} | kept
+    succeeds = [item.strict_success if strict else item.success for item in placements]
+    filled = {item.goal for item, good in zip(placements, succeeds, strict=True) if good} | kept
     loose = []
-    for index, (item, X_WB) in enumerate(
-        zip(placements, station.object_poses(root_context), strict=True)
-    ):
+    for index, X_WB in enumerate(station.object_poses(root_context)):
         distance = math.hypot(*X_WB.translation())
         # The comparison is also false if the distance is NaN.
-        if not item.success and distance < GONE:
+        if not succeeds[index] and distance < GONE:
             loose.append(index)
     return loose, [index for index in range(len(station.scene.goals)) if index not in filled]

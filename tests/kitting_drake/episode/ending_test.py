@@ -24,6 +24,8 @@ class Cell:
     kept: frozenset[int] = frozenset()
     last: str = "missed"
     """The outcome of the last action."""
+    protrudes: float = 0.0
+    """How much too high the objects are, in m."""
 
     @property
     def scene(self) -> Any:
@@ -38,7 +40,8 @@ class Cell:
         return [PlacedObject(f"o{i}", BodyIndex(i), POINTS) for i in range(len(self.filled))]
 
     def placements(self, _: object) -> list[Placement]:
-        return [Placement(goal, share=float(goal is not None)) for goal in self.filled]
+        errors = {"angle_error": 0.0, "height_error": self.protrudes}
+        return [Placement(goal, share=float(goal is not None), **errors) for goal in self.filled]
 
     def object_poses(self, _: object) -> list[RigidTransform]:
         return [RigidTransform([0.3 + 0.1 * i, 0.0, 0.0]) for i in range(len(self.filled))]
@@ -73,8 +76,20 @@ KEPT = Cell((goal(0), goal(1)), (0, None), kept=frozenset({1}))
         (dataclasses.replace(ONE_LEFT, filled=(0,), last="placed"), {"done", "nothing fits"}),
         (FOREIGN, {"done", "nothing fits"}),
         (KEPT, {"done", "nothing fits"}),
+        (
+            dataclasses.replace(ALL_PLACED, protrudes=0.005),
+            {"done", "gave up", "not sure", "not seen", "actions spent", "time", "failure"},
+        ),
     ],
-    ids=["one left", "all placed", "all placed at last", "a cavity left", "foreign", "kept"],
+    ids=[
+        "one left",
+        "all placed",
+        "all placed at last",
+        "a cavity left",
+        "foreign",
+        "kept",
+        "high",
+    ],
 )
 def test_a_reason_is_judged_by_the_true_state(cell: Any, right: set[str]):
     reasons = ["done", "nothing fits", "gave up", "not sure", "not seen", "actions spent"]
