@@ -22,9 +22,9 @@ def guarded_marks(
     hover = state.pick_hover_z if mode == Mode.DESCEND else state.place_hover_z
     first = hover - parameters.hover_clearance + margin
     if mode == Mode.DESCEND:
-        # Contact is expected only if the hand presses; on the way to a grasp the jaws should touch
-        # nothing.
-        return first, state.pick_top_z + margin if state.press else state.grasp_z
+        # Contact is expected only if the hand presses: the closed jaws may touch the object, or a
+        # higher surface beside it. On the way to a grasp the jaws should touch nothing.
+        return first, first if state.press else state.grasp_z
     # First either the object touches the floor of its place, or the fingertips touch the rim beside
     # the place. Use the higher contact.
     hanging = state.hold_z - state.support_z + state.hanging

@@ -775,6 +775,15 @@ def test_a_press_without_contact_ends_at_its_depth():
     assert z == pytest.approx(HEIGHTS.pick_top - PARAMETERS.press_depth, abs=2e-3)
 
 
+def test_a_press_touches_a_rim_beside_the_object_slowly():
+    heights = dataclasses.replace(HEIGHTS, near_pick=0.056)
+    answer = dataclasses.replace(ACTION, press=True, heights=heights)
+    run = Run(World(touch_pick=0.056, stiffness=1e4), answer=answer).until(Mode.DESCEND)
+    while run.output("desired_motion")[2] > 0.056:
+        run.simulator.AdvanceTo(run.simulator.get_context().get_time() + 1 / 128)
+    assert 0 < -run.output("desired_motion")[6] <= PARAMETERS.touch_speed + 1e-6
+
+
 GUARDED = dataclasses.replace(PARAMETERS, force_limit=30.0)
 SOFT = 2000.0
 LATERAL, PUSH = (0.0, 31.0, 0.0), (0.0, 0.0, 31.0)
