@@ -40,6 +40,9 @@ _MOST_REMOVALS = 3
 _LEAST_SHARE = 0.5
 """A region that contains an object for an open recess has at least this share of the smallest open
 recess's area."""
+_LEAST_REACH = 0.4
+"""Such a region reaches at least this share as far from its middle as the recess with the smallest
+reach. A leaning or partly hidden object looks shorter than its recess."""
 _SEVERAL = 0.75
 """A region that may contain several objects has at least this share of the total area of as many
 open recesses, the largest ones."""
@@ -132,7 +135,12 @@ class Inventory:
         if not areas:
             return ()
         least, most = _LEAST_SHARE * min(areas), _LARGEST_SHARE * sum(areas)
-        return tuple(item for item in self.strangers if least <= item.mask.sum() <= most)
+        reach = _LEAST_REACH * min(map(_reach, self.open_recesses))
+        return tuple(
+            item
+            for item in self.strangers
+            if least <= item.mask.sum() <= most and _reach(item) >= reach
+        )
 
     @property
     def left_over(self) -> LeftOver:
@@ -344,6 +352,12 @@ def _nearest(objects: Sequence[Sequence[Attempt]], middle: tuple[float, float]) 
     away = np.array([math.dist(_middle_left_at(moves[-1]), middle) for moves in objects])
     nearest = int(np.flatnonzero(away < away.min() + _THERE)[-1])
     return nearest if away[nearest] < _SAME_OBJECT else None
+
+
+def _reach(region: Region) -> float:
+    """Returns the largest distance of a region's pixels from their mean, in pixels."""
+    pixels = region.pixels
+    return float(np.linalg.norm(pixels - pixels.mean(axis=0), axis=1).max())
 
 
 def _found_at(attempt: Attempt) -> tuple[float, float]:

@@ -225,6 +225,8 @@ def segment(observation: Observation) -> Segmentation:
         depth[~inside] = 0
         # Add each unseen region to the recess that it touches.
         hidden = inside & ~observation.valid
+    # With noise, the highest pixel is no measure of the top.
+    top = float(np.percentile(relief[fixture], 75)) if fixture.any() else 0.0
     deep = depth > max(RECESS_DEPTH, _CLEARLY * noise)
     return Segmentation(
         fixture=fixture,
@@ -234,7 +236,7 @@ def segment(observation: Observation) -> Segmentation:
             # Ignore regions of mostly unseen pixels: in the shadow of a block, a few wrong depths
             # can make the filled-in heights look like an object.
             if observation.valid[item.mask].mean() > _OBJECT_SEEN
-            and not _is_corner(item, fixture, float(relief[fixture].max(initial=0)), resolution)
+            and not _is_corner(item, fixture, top, resolution)
         ),
         recesses=_regions(deep | hidden, depth, resolution, areas.recess, core=deep),
         protruding=tuple(
@@ -251,8 +253,13 @@ def segment(observation: Observation) -> Segmentation:
 
 
 def _is_corner(item: Region, fixture: Mask, top: float, resolution: float) -> bool:
-    """Whether a small region is a corner of the fixture that the mask `fixture` misses."""
-    if item.mask.sum() * resolution**2 >= LEAST_AREA or item.height < top - PLANE_BAND:
+    """Whether a region that is small, or lies at the image's border, is a part of the fixture that
+    the mask `fixture` misses."""
+    border = item.mask.copy()
+    border[1:-1, 1:-1] = False
+    if item.mask.sum() * resolution**2 >= LEAST_AREA and not border.any():
+        return False
+    if item.height < top - PLANE_BAND:
         return False
     near = ndimage.binary_dilation(item.mask, iterations=round(2 * _FIXTURE_MARGIN / resolution))
     return bool((near & fixture).any())

@@ -63,3 +63,17 @@ def test_a_shallow_recess_does_not_tilt_the_top_of_its_fixture():
     depths = sorted(item.height for item in found.free_recesses)
     assert depths == pytest.approx([0.0035, 0.02], abs=2e-4)
     assert np.abs(found.depth[52:88, 45:70] - 0.0035).max() < 3e-4
+
+
+def test_a_strip_of_a_block_at_the_border_is_no_object():
+    """The corner of a block that leaves the image is not within the convex hull of its plateau."""
+    rows, cols = np.indices(GRID.shape)
+    height = np.where((rows > 100) & (cols > 60) & (cols < 150), 0.05, 0.0).astype(np.float32)
+    height[110:140, 80:100] = 0.03
+    # Near the border the measured height falls.
+    height[-3:, 60:100] = np.where(height[-3:, 60:100] > 0, 0.0462, 0.0)
+    height[-3:, 100:150] = 0.0
+    height[20:40, 200:240] = 0.02
+    image = np.full((4, *GRID.shape), 0.5, np.float32)
+    image[3] = height
+    assert [round(item.height, 3) for item in segment(Observation(image, GRID)).objects] == [0.02]
