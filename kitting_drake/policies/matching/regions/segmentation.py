@@ -226,7 +226,7 @@ def segment(observation: Observation) -> Segmentation:
         # Add each unseen region to the recess that it touches.
         hidden = inside & ~observation.valid
     # With noise, the highest pixel is no measure of the top.
-    top = float(np.percentile(relief[fixture], 75)) if fixture.any() else 0.0
+    highest = float(np.percentile(relief[fixture], 75)) if fixture.any() else 0.0
     deep = depth > max(RECESS_DEPTH, _CLEARLY * noise)
     return Segmentation(
         fixture=fixture,
@@ -236,7 +236,7 @@ def segment(observation: Observation) -> Segmentation:
             # Ignore regions of mostly unseen pixels: in the shadow of a block, a few wrong depths
             # can make the filled-in heights look like an object.
             if observation.valid[item.mask].mean() > _OBJECT_SEEN
-            and not _is_corner(item, fixture, top, resolution)
+            and not _is_corner(item, fixture, highest, resolution)
         ),
         recesses=_regions(deep | hidden, depth, resolution, areas.recess, core=deep),
         protruding=tuple(
