@@ -111,7 +111,8 @@ class PickPlacePlanner(LeafSystem):
       of an impact is proportional to the speed.
     - `CHECK`: a grasp is good if the pads are further apart than `minimum_width` and both feel at
       least half of the grasp force. If the grasp is not good, or is lost later, the hand retreats
-      and observes again. The attempt counts as an action.
+      and observes again. The attempt counts as an action. If the hand feels a lateral force at
+      rest, the jaws grip something fixed, and let go.
     - `LIFT`, `CARRY`: the more the object weighs, and the larger the moment of its weight about the
       axis of the pads, the more firmly it is gripped (`grip_force`), but less firmly if the jaws
       sink in (`soft_force`). A heavy object is lifted only once the grip is firm. A floating hand

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,6 +31,8 @@ _HOLDING = (Mode.LIFT, Mode.CARRY, Mode.LOWER, Mode.SEARCH, Mode.RELEASE)
 _STEADY = 0.6
 """An object has turned if its lever (see `felt_lever`) falls below this fraction of its earlier
 value."""
+_FIXED = 20.0
+"""If the closed jaws feel a lateral force above this at rest, in N, they grip something fixed."""
 _STUCK = 0.004
 """If the opening of the jaws stays below its goal by more than this, in m, they stick to the
 object."""
@@ -162,11 +165,15 @@ class PickPlaceSteps:
             self._motion.begin(state, Mode.CHECK, time, opening=opening)
 
     def check(self, moment: Moment) -> None:
-        """Begins the lift if an object is between the pads, else retreats."""
+        """Begins the lift if a loose object is between the pads, else lets go and retreats."""
         state, time, hand, contact = moment.state, moment.time, moment.hand, moment.contact
         if time < self._motion.arrival(state) + self._settle:
             return
-        if self._is_held(hand, contact):
+        if self._is_held(hand, contact) and math.hypot(*contact[:2]) > _FIXED:
+            # The jaws also grip something that does not move, such as the wall of a kit.
+            state.stopped, state.stops = state.stopped + 1, 1
+            self._motion.begin(state, Mode.RELEASE, time)
+        elif self._is_held(hand, contact):
             state.hold_z, state.held_width = hand[2], hand[4] + hand[5]
             state.gentleness = state.trusts_grip = 0
             begin_lift(state, float(hand[2]))

@@ -893,3 +893,14 @@ def test_what_is_laid_aside_is_lowered_slowly_from_higher_up():
         run.simulator.AdvanceTo(run.simulator.get_context().get_time() + 1 / 128)
     assert len(slow) > 50
     assert max(slow) <= PARAMETERS.contact_speed + 1e-6
+
+
+@pytest.mark.parametrize(("force", "lets_go"), [(25.0, True), (15.0, False)])
+def test_jaws_that_grip_something_fixed_let_go(force: float, lets_go: bool):
+    jam = Jam(mode=Mode.CHECK, force=(0.0, force, 0.0), stiffness=SOFT)
+    run = Run(jam, parameters=GUARDED).finish()
+    after = run.sequence[run.sequence.index(Mode.CHECK) + 1]
+    assert after == (Mode.RELEASE if lets_go else Mode.LIFT)
+    (attempt,) = run.output("history")
+    assert attempt.outcome == ("stopped" if lets_go else "placed")
+    assert run.output("counts").tolist() == [1, 0, 0, float(lets_go)]
