@@ -43,6 +43,8 @@ this many standard deviations of the noise."""
 _SUNK = 0.003
 """A table that looks lower than expected by more than this, in metres, is taken to be really lower.
 Any other deviation counts as a calibration error."""
+_LONE = 0.02
+"""A pixel that is higher than all its neighbours by more than this, in metres, shows no surface."""
 _TILT_DOUBT, _MOST_DOUBT = 0.3, 0.0025
 """The uncertainty of heights is the noise plus `_TILT_DOUBT` times the table's deviation before
 levelling. This sum is limited to `_MOST_DOUBT`, in metres."""
@@ -56,7 +58,7 @@ def read_surface_heights(
     - Unseen pixels are filled in (`fill_unseen`).
     - An object's support is a low percentile of the heights around it. An object in the middle of
       others is thus assumed to stand on the same surface as the others.
-    - Tops are maxima over a few pixels. The floor of a place is the minimum over the seen pixels.
+    - Tops are maxima over a few pixels, without lone peaks. The floor of a place is the minimum over the seen pixels.
       If o_t is noisy, medians and percentiles are used instead, corrected for their bias.
     - The table is assumed to be level and at the bottom of the grid. If it looks tilted or shifted
       in o_t, this counts as a calibration error, and `project` has subtracted it.
@@ -99,6 +101,7 @@ def read_surface_heights(
     else:
         pick_top, place_rim = float(top.max(initial=0.0)), float(rim.max(initial=0.0))
         place_floor = float(floor.min())
+    solid = _without_lone_peaks(height)
     sunk = [_sunk(observation, pixel) for pixel in (at_pick, at_place)]
     pick_z, place_z = (grid.z_min + value for value in sunk)
     return SurfaceHeights(
@@ -106,13 +109,25 @@ def read_surface_heights(
         support=pick_z + support,
         place_rim=place_z + place_rim,
         place_floor=place_z + place_floor,
-        near_pick=pick_z + float(_around(height, at_pick, reach["near_pick"]).max(initial=0.0)),
-        near_place=place_z + float(_around(height, at_place, reach["near_place"]).max(initial=0.0)),
-        highest=grid.z_min + float(height.max(initial=0.0)),
+        near_pick=pick_z + float(_around(solid, at_pick, reach["near_pick"]).max(initial=0.0)),
+        near_place=place_z + float(_around(solid, at_place, reach["near_place"]).max(initial=0.0)),
+        highest=grid.z_min + float(solid.max(initial=0.0)),
         table=min(pick_z, place_z) + max(table, 0.0),
         doubt=doubt,
         width=object_width(height, grid, pick, support, pick_top),
     )
+
+
+def _without_lone_peaks(height: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Heights (rows, cols) in which no pixel is higher than its highest neighbour by more than
+    `_LONE`. Depth cameras put such pixels between the silhouette of a near body, such as an arm,
+    and what lies behind it."""
+    from scipy import ndimage
+
+    around = np.ones((3, 3), bool)
+    around[1, 1] = False
+    highest = ndimage.maximum_filter(height, footprint=around, mode="nearest")
+    return np.minimum(height, highest + np.float32(_LONE))
 
 
 def _deviation(observation: Observation) -> float:

@@ -120,3 +120,15 @@ def test_a_table_far_above_the_bottom_of_the_grid_is_not_corrected():
     found = read_surface_heights(Observation(image, GRID), PICK, PLACE)
     assert found.table == pytest.approx(GRID.z_min + 0.02, abs=1e-6)
     assert found.doubt == 0
+
+
+def test_a_lone_high_pixel_is_no_surface():
+    seen = observation((PICK, 0.01, 0.03), (PlanarPose(0.60, -0.215), 0.01, 0.05))
+    image = seen.image.copy()
+    image[3, 70, 160] = 0.106 - GRID.z_min
+    found = read_surface_heights(Observation(image, GRID), PICK, PLACE)
+    assert found.highest == pytest.approx(0.05, abs=1e-6)
+    # Two neighbours are a surface.
+    image[3, 71, 160] = 0.106 - GRID.z_min
+    found = read_surface_heights(Observation(image, GRID), PICK, PLACE)
+    assert found.highest == pytest.approx(0.106, abs=1e-6)
