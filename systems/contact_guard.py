@@ -26,7 +26,8 @@ _UNWEIGHED = (Mode.LIFT, Mode.CARRY)
 """The modes in which an object of unknown weight may be in the hand."""
 _LETS_GO = (Mode.RELEASE, Mode.RETREAT)
 _RISES = (Mode.LIFT, Mode.RETREAT)
-_IN_THE_AIR = (Mode.APPROACH, Mode.CARRY)
+_AT_ONCE = (Mode.APPROACH, Mode.CHECK, Mode.CARRY)
+"""The modes in which the guard acts at once, because the hand is in the air, or at rest."""
 _AT_REST = (Mode.OBSERVE, Mode.DONE)
 
 
@@ -58,8 +59,8 @@ class ContactGuard:
     - In `RELEASE` and `RETREAT` the jaws may or may not still hold the object, so any f_z between
       the object's weight and zero counts as no contact.
 
-    The guard acts if the vertical or the lateral force exceeds the limit. In `APPROACH` and
-    `CARRY`, where nothing should touch the hand, it acts at once; in other modes, after 1/64 s. A
+    The guard acts if the vertical or the lateral force exceeds the limit. In `APPROACH`, `CHECK`
+    and `CARRY`, where no impact is expected, it acts at once; in other modes, after 1/64 s. A
     push from below does not count while the hand rises. Vertical forces do not count while the
     hand presses an object down; then `press_force` is the limit.
 
@@ -125,7 +126,7 @@ class ContactGuard:
             push = 0.0
         is_beyond = max(push, lateral) > self._limit
         state.beyond = state.beyond + self._step if is_beyond else 0.0
-        must_stop = is_beyond and (mode in _IN_THE_AIR or state.beyond > _LASTING)
+        must_stop = is_beyond and (mode in _AT_ONCE or state.beyond > _LASTING)
         if must_stop:
             self._keep_peaks(state, abs(vertical), lateral)
         return must_stop

@@ -26,7 +26,7 @@ from systems.pick_place_parameters import Mode, PickPlaceParameters
 from systems.planner_state import PlannerState, Z
 from systems.robot_motion import RobotMotion
 
-_HOLDING = (Mode.LIFT, Mode.CARRY, Mode.LOWER, Mode.SEARCH, Mode.RELEASE)
+_HOLDING = (Mode.CHECK, Mode.LIFT, Mode.CARRY, Mode.LOWER, Mode.SEARCH, Mode.RELEASE)
 """The modes in which an object may be in the hand."""
 _STEADY = 0.6
 """An object has turned if its lever (see `felt_lever`) falls below this fraction of its earlier
@@ -171,8 +171,7 @@ class PickPlaceSteps:
             return
         if self._is_held(hand, contact) and math.hypot(*contact[:2]) > _FIXED:
             # The jaws also grip something that does not move, such as the wall of a kit.
-            state.stopped, state.stops = state.stopped + 1, 1
-            self._motion.begin(state, Mode.RELEASE, time)
+            self.stop(moment)
         elif self._is_held(hand, contact):
             state.hold_z, state.held_width = hand[2], hand[4] + hand[5]
             state.gentleness = state.trusts_grip = 0

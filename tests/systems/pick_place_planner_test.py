@@ -796,6 +796,7 @@ LATERAL, PUSH = (0.0, 31.0, 0.0), (0.0, 0.0, 31.0)
         (Mode.APPROACH, LATERAL),
         (Mode.DESCEND, LATERAL),
         (Mode.CLOSE, PUSH),
+        (Mode.CHECK, LATERAL),
         (Mode.LIFT, LATERAL),
         (Mode.CARRY, LATERAL),
         (Mode.LOWER, LATERAL),
@@ -806,7 +807,7 @@ LATERAL, PUSH = (0.0, 31.0, 0.0), (0.0, 0.0, 31.0)
 def test_a_contact_force_beyond_the_limit_stops_the_action(mode: Mode, force: tuple):
     run = Run(Jam(mode=mode, force=force, stiffness=SOFT), parameters=GUARDED).finish()
     after = run.sequence[run.sequence.index(mode) + 1 :]
-    holds = Mode.LIFT <= mode < Mode.RELEASE
+    holds = Mode.CHECK <= mode < Mode.RELEASE
     assert after[:2] == [Mode.RELEASE, Mode.RETREAT] if holds else Mode.RETREAT in [mode, after[0]]
     assert run.output("counts").tolist() == [1, 0, 0, 1]
     (attempt,) = run.output("history")
