@@ -58,6 +58,8 @@ _ABOVE = (_ELBOW, _FOREARM, _WRIST, _LAST)
 among the objects."""
 _OUTER = (_FOREARM, _WRIST, _LAST, _HAND)
 """The links that could hit the arm's own base."""
+_HIGH = (_ELBOW, _FOREARM)
+"""Those of `_ABOVE` that may be far from the hand."""
 _LEAST = 0.01
 """A capsule closer than this to something else, in m, counts as colliding."""
 _POINTS = 7
@@ -92,9 +94,10 @@ def link_points(q: NDArray[np.float64], base: ArmBase) -> NDArray[np.float64]:
 def collision(
     q: NDArray[np.float64],
     base: ArmBase,
-    surface: float,
+    surface: float | NDArray[np.float64],
     obstacles: Sequence[Capsule] = (),
     held: float = 0.0,
+    highest: float | None = None,
 ) -> str:
     """Names what the arm collides with at any of the given joint positions; empty if
     it does not collide.
@@ -102,10 +105,11 @@ def collision(
     Args:
         q: (n, 7) joint positions, in rad.
         base: pose of the arm's base in the world.
-        surface: world z of the highest surface around the hand, in m. The hand itself is not
-            compared with it, because the fingers must go below it.
+        surface: world z of the highest surface below the wrist, in m; one for all positions, or
+            (n). The hand itself is not compared with it, because the fingers must go below it.
         obstacles: capsules around bodies that do not move, in the world.
         held: how far a held object reaches from the fingertips, in m; zero if the hand is empty.
+        highest: world z of the highest surface below forearm and elbow, in m; None for `surface`.
     """
     rotations, origins = joint_frames(q)
 
@@ -119,7 +123,8 @@ def collision(
     placed = {link: ends(link) for link in (*_ABOVE, *outer, _UPPER_ARM)}
     for link in _ABOVE:
         lowest = np.minimum(*(end[:, 2] for end in placed[link])) - link.capsule.radius
-        if lowest.min() < surface - base.z + _LEAST:
+        below = highest if highest is not None and link in _HIGH else surface
+        if (lowest < below - base.z + _LEAST).any():
             return "the table or an object near the hand"
     own = [(np.array(it.start), np.array(it.end), it.radius) for it in _BASE]
     own.append((*placed[_UPPER_ARM], _UPPER_ARM.capsule.radius))

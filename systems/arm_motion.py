@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from systems.arm_collisions import Capsule
 from systems.arm_inertia import ArmInertia
-from systems.arm_kinematics import ArmBase
+from systems.arm_kinematics import ArmBase, fingertips
 from systems.arm_limits import JOINTS, ArmLimits
 from systems.arm_postures import ArmPostures, HandStop
 from systems.arm_reach import hand_stops
@@ -36,6 +36,8 @@ _SAME_HEIGHT = 0.003
 _HELD_REACH = 0.125
 """A held object reaches at most this far from the fingertips, in m. `read_surface_heights` assumes
 the same."""
+_RISES_WITHIN = 0.05
+"""Within this horizontal distance of the pick, in m, the hand rises from it, or sinks to it."""
 _TOO_LOW = 0.010
 """A motion on which the hand sinks below the clear height by more than this, in m, is not begun."""
 _TOUCH_SPEED = 0.011
@@ -142,7 +144,13 @@ class ArmMotion(JawMotion):
         )
         pick, place = (PlanarPose(*pose.tolist()) for pose in (state.pick, state.place))
         return hand_stops(
-            pick, None if state.press else place, heights, state.table_z, self._parameters
+            pick,
+            None if state.press else place,
+            heights,
+            state.table_z,
+            self._parameters,
+            (state.around_pick_z, state.around_place_z),
+            state.floor_z + max(state.grasp_z - state.support_z, 0.0),
         )
 
     def reach_problem(self, state: PlannerState) -> str:
@@ -170,16 +178,26 @@ class ArmMotion(JawMotion):
         it touches nothing."""
         trial = self.view(np.array(state.vector))
         now = self._way(trial).at(math.inf)
-        surface = float(state.clear_z) - self._parameters.travel_clearance
-        ways = [(Mode.APPROACH, "pick"), (Mode.DESCEND, "pick"), (Mode.RETREAT, "home")]
+        highest = float(state.clear_z) - self._parameters.travel_clearance
+        at_pick, at_place = float(state.around_pick_z), float(state.around_place_z)
+        last = at_pick if state.press else at_place
+        ways = [
+            (Mode.APPROACH, "pick", at_pick),
+            (Mode.DESCEND, "pick", at_pick),
+            (Mode.RETREAT, "home", last),
+        ]
         if not state.press:
-            ways.insert(2, (Mode.LIFT, "place"))
-        for mode, name in ways:
+            ways.insert(2, (Mode.LIFT, "place", max(at_pick, at_place)))
+        for mode, name, most in ways:
             self._set_way(trial, mode, now, None, None)
             way = self._way(trial)
             now = way.at(math.inf)
             held = _HELD_REACH if mode == Mode.LIFT else 0.0
-            touched = self.postures.collision(way.positions(), surface, held)
+            positions = way.positions()
+            tips = self.postures.base.to_world(fingertips(positions))
+            rises = np.linalg.norm(tips[:, :2] - state.pick[:2], axis=1) < _RISES_WITHIN
+            surface = np.where(rises, at_pick, most)
+            touched = self.postures.collision(positions, surface, held, highest)
             if touched:
                 return f"on the way to the {name} the arm would collide with {touched}"
             if way.missing > _TOO_LOW:

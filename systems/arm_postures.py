@@ -59,7 +59,9 @@ class HandStop:
     high: float
     """Highest height of the fingertips, in m."""
     surface: float
-    """Height of the highest surface around the hand, in m."""
+    """Height of the highest surface below the wrist, in m."""
+    highest: float | None = None
+    """Height of the highest surface below forearm and elbow, in m; None for `surface`."""
 
 
 class ArmPostures:
@@ -164,10 +166,10 @@ class ArmPostures:
         share = np.linspace(0.0, 1.0, _CHECKED)[:, None]
         ways = [start + share * (end - start) for start, end in itertools.pairwise(way)]
         highest = max(stops, key=lambda stop: stop.surface)
-        if not self.collision(np.concatenate(ways), highest.surface):
+        if not self.collision(np.concatenate(ways), highest.surface, highest=highest.highest):
             return ""
         for stop, points in zip(stops, ways, strict=True):
-            touched = self.collision(points, stop.surface)
+            touched = self.collision(points, stop.surface, highest=stop.highest)
             if touched:
                 return f"on the way to {stop.name} the arm would collide with {touched}"
         return ""
@@ -244,9 +246,13 @@ class ArmPostures:
             for way in self._ways(stop, stop.yaw + half_turn * math.pi, swivels)
             if self.within(way).all() and self._is_continuous(way)
         ]
+
         # Usually nothing collides, so check all postures in one call first.
-        if found and self.collision(np.concatenate([way for _, way in found]), stop.surface):
-            found = [item for item in found if not self.collision(item[1], stop.surface)]
+        def touches(way: NDArray[np.float64]) -> bool:
+            return bool(self.collision(way, stop.surface, highest=stop.highest))
+
+        if found and touches(np.concatenate([way for _, way in found])):
+            found = [item for item in found if not touches(item[1])]
         return [(turned, way[-1]) for turned, way in found]
 
     def _is_continuous(self, way: NDArray[np.float64]) -> bool:
@@ -263,9 +269,15 @@ class ArmPostures:
         line = self.along(np.linspace(top, bottom, _CHECKED), way[-1])
         return bool(self.within(line).all())
 
-    def collision(self, way: NDArray[np.float64], surface: float, held: float = 0.0) -> str:
+    def collision(
+        self,
+        way: NDArray[np.float64],
+        surface: float | NDArray[np.float64],
+        held: float = 0.0,
+        highest: float | None = None,
+    ) -> str:
         """Names what the arm collides with; see `arm_collisions.collision`."""
-        return collision(way, self.base, surface, self._obstacles, held)
+        return collision(way, self.base, surface, self._obstacles, held, highest)
 
     def _ways(
         self, stop: HandStop, yaw: float, swivels: NDArray[np.float64]
@@ -300,7 +312,7 @@ class ArmPostures:
             return [way for way in ways if self.within(way).all()]
 
         found = reached(stop.yaw, stop.yaw + math.pi)
-        touched = [self.collision(way, stop.surface) for way in found]
+        touched = [self.collision(way, stop.surface, highest=stop.highest) for way in found]
         if found and all(touched):
             return f"for {where} the arm would collide with {touched[0]}"
         if found:

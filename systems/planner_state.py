@@ -52,6 +52,10 @@ class PlannerState(VectorView):
     rim_z = Number()
     """Lower bound of the height of the rim around the place."""
     floor_z = Number()
+    around_pick_z = Number()
+    """Height of the highest surface below an arm's wrist at the pick; `around_place_z` is that at
+    the place."""
+    around_place_z = Number()
     doubt = Number()
     """The uncertainty of the surface heights."""
     width = Number()
@@ -132,6 +136,8 @@ class PlannerState(VectorView):
         # object that seems to be slightly below the rim still counts as standing on it.
         self.rim_z = surfaces.place_rim - surfaces.doubt
         self.floor_z, self.doubt = surfaces.place_floor, surfaces.doubt
+        self.around_pick_z = min(surfaces.around_pick, surfaces.highest)
+        self.around_place_z = min(surfaces.around_place, surfaces.highest)
         self.width = surfaces.width
         self.clear_z, self.travel_z = motion.clear, motion.travel
         self.pick_hover_z, self.place_hover_z = motion.pick_hover, motion.place_hover

@@ -234,6 +234,10 @@ class SurfaceHeights:
     """Height of the highest surface below the held object at the place."""
     highest: float = 0.0
     """Height of the highest surface in the workspace."""
+    around_pick: float = math.inf
+    """Height of the highest surface below an arm's wrist at the pick; infinite if unknown.
+    `around_place` is that at the place."""
+    around_place: float = math.inf
     table: float = 0.0
     """Height of the table. The hand never goes below it."""
     doubt: float = 0.0

@@ -18,6 +18,8 @@ _PICK_CLEARANCE_REACH = 0.07
 """The open jaws stay within this distance of the pick, in metres."""
 _PLACE_CLEARANCE_REACH = 0.125
 """The held object stays within this distance of the place, in metres."""
+_WRIST_REACH = 0.2
+"""An arm's wrist stays within this distance of the hand, in metres."""
 _SUPPORT_REACH = 0.08
 """The object's support is searched for within this distance of the pick, in metres."""
 _SUPPORT_SHARE = 10.0
@@ -79,6 +81,7 @@ def read_surface_heights(
             ("support", _SUPPORT_REACH),
             ("near_pick", _PICK_CLEARANCE_REACH),
             ("near_place", _PLACE_CLEARANCE_REACH),
+            ("wrist", _WRIST_REACH),
         )
     }
     height = observation.filled_height
@@ -102,6 +105,7 @@ def read_surface_heights(
         pick_top, place_rim = float(top.max(initial=0.0)), float(rim.max(initial=0.0))
         place_floor = float(floor.min())
     solid = _without_lone_peaks(height)
+    around = [grid.z_min + _highest(solid, it, reach["wrist"]) for it in (at_pick, at_place)]
     sunk = [_sunk(observation, pixel) for pixel in (at_pick, at_place)]
     pick_z, place_z = (grid.z_min + value for value in sunk)
     return SurfaceHeights(
@@ -109,9 +113,11 @@ def read_surface_heights(
         support=pick_z + support,
         place_rim=place_z + place_rim,
         place_floor=place_z + place_floor,
-        near_pick=pick_z + float(_around(solid, at_pick, reach["near_pick"]).max(initial=0.0)),
-        near_place=place_z + float(_around(solid, at_place, reach["near_place"]).max(initial=0.0)),
+        near_pick=pick_z + _highest(solid, at_pick, reach["near_pick"]),
+        near_place=place_z + _highest(solid, at_place, reach["near_place"]),
         highest=grid.z_min + float(solid.max(initial=0.0)),
+        around_pick=around[0],
+        around_place=around[1],
         table=min(pick_z, place_z) + max(table, 0.0),
         doubt=doubt,
         width=object_width(height, grid, pick, support, pick_top),
@@ -161,6 +167,11 @@ def _noise(height: NDArray[np.float32]) -> float:
         return 0.0
     noise = 1.4826 * float(np.median(away))
     return noise if noise >= _CLEAN else 0.0
+
+
+def _highest(height: NDArray[np.float32], pixel: NDArray[np.float64], reach: int) -> float:
+    """The greatest height at most `reach` rows and columns away from a position (row, col)."""
+    return float(_around(height, pixel, reach).max(initial=0.0))
 
 
 def _around(values: NDArray[Any], pixel: NDArray[np.float64], reach: int) -> NDArray[Any]:

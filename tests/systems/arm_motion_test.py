@@ -296,3 +296,18 @@ def test_the_way_back_and_the_held_object_must_be_free_too():
     assert problem(Capsule((0.8, 0.0, 0.0), (0.8, 0.0, 0.07), 0.02)) == ""
     # Only the way home passes through the space high above the place.
     assert "home" in problem(Capsule((0.55, -0.3, 0.46), (0.55, -0.3, 0.48), 0.03))
+
+
+@pytest.mark.parametrize(("at_pick", "is_possible"), [(0.0, True), (0.14, False)])
+def test_a_tall_thing_matters_only_if_it_is_near_the_wrist(at_pick: float, is_possible: bool):
+    motion = motion_of()
+    state = motion.view(motion.initial_state())
+    set_action(state, (0.5, -0.25, 0.4), (0.58, 0.28, 1.5))
+    state.clear_z = 0.14 + PARAMETERS.travel_clearance
+    state.travel_z = state.clear_z + 0.015
+    state.around_pick_z, state.around_place_z = at_pick, 0.14
+    # The object is placed onto something 0.1 m high.
+    state.floor_z, state.rim_z, state.place_hover_z = 0.1, 0.1, 0.13
+    assert motion.prepare(state) == is_possible
+    if not is_possible:
+        assert "an object near the hand" in motion.reach_problem(state)

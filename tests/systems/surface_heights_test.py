@@ -132,3 +132,10 @@ def test_a_lone_high_pixel_is_no_surface():
     image[3, 71, 160] = 0.106 - GRID.z_min
     found = read_surface_heights(Observation(image, GRID), PICK, PLACE)
     assert found.highest == pytest.approx(0.106, abs=1e-6)
+
+
+def test_what_is_far_from_the_wrist_is_not_around_it():
+    seen = observation((PICK, 0.01, 0.03), (PlanarPose(0.60, -0.215), 0.01, 0.12))
+    found = read_surface_heights(seen, PICK, PLACE)
+    assert found.around_pick == pytest.approx(0.03, abs=1e-6)
+    assert found.around_place == found.highest == pytest.approx(0.12, abs=1e-6)
