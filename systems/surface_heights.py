@@ -45,8 +45,9 @@ this many standard deviations of the noise."""
 _SUNK = 0.003
 """A table that looks lower than expected by more than this, in metres, is taken to be really lower.
 Any other deviation counts as a calibration error."""
-_LONE = 0.02
-"""A pixel that is higher than all its neighbours by more than this, in metres, shows no surface."""
+_LONE, _NEIGHBOURS = 0.02, 4
+"""A pixel shows a surface only if at least `_NEIGHBOURS` of its neighbours are higher than it, or
+lower by at most `_LONE`, in metres."""
 _TILT_DOUBT, _MOST_DOUBT = 0.3, 0.0025
 """The uncertainty of heights is the noise plus `_TILT_DOUBT` times the table's deviation before
 levelling. This sum is limited to `_MOST_DOUBT`, in metres."""
@@ -125,15 +126,15 @@ def read_surface_heights(
 
 
 def _without_lone_peaks(height: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Heights (rows, cols) in which no pixel is higher than its highest neighbour by more than
-    `_LONE`. Depth cameras put such pixels between the silhouette of a near body, such as an arm,
-    and what lies behind it."""
+    """Heights (rows, cols) in which no pixel is higher than its `_NEIGHBOURS`-highest neighbour by
+    more than `_LONE`. Depth cameras put such pixels between the silhouette of a near body, such as
+    an arm, and what lies behind it."""
     from scipy import ndimage
 
     around = np.ones((3, 3), bool)
     around[1, 1] = False
-    highest = ndimage.maximum_filter(height, footprint=around, mode="nearest")
-    return np.minimum(height, highest + np.float32(_LONE))
+    support = ndimage.rank_filter(height, -_NEIGHBOURS, footprint=around, mode="nearest")
+    return np.minimum(height, support + np.float32(_LONE))
 
 
 def _deviation(observation: Observation) -> float:

@@ -128,8 +128,8 @@ def test_a_lone_high_pixel_is_no_surface():
     image[3, 70, 160] = 0.106 - GRID.z_min
     found = read_surface_heights(Observation(image, GRID), PICK, PLACE)
     assert found.highest == pytest.approx(0.05, abs=1e-6)
-    # Two neighbours are a surface.
-    image[3, 71, 160] = 0.106 - GRID.z_min
+    # Six pixels are a surface.
+    image[3, 70:72, 160:163] = 0.106 - GRID.z_min
     found = read_surface_heights(Observation(image, GRID), PICK, PLACE)
     assert found.highest == pytest.approx(0.106, abs=1e-6)
 
