@@ -40,6 +40,9 @@ _RISES_WITHIN = 0.05
 """Within this horizontal distance of the pick, in m, the hand rises from it, or sinks to it."""
 _TOO_LOW = 0.010
 """A motion on which the hand sinks below the clear height by more than this, in m, is not begun."""
+_CAREFUL_SPEED = 0.02
+"""Upper limit of `contact_speed` for an arm, in m/s, if the heights are uncertain: then it may touch
+something where nothing is expected."""
 _TOUCH_SPEED = 0.011
 """Upper limit of `touch_speed` for an arm, in m/s. The force of an impact is proportional to mass
 times speed. The mass that moves with an arm's hand is 10 to 25 kg; with the floating hand it is 4
@@ -265,6 +268,8 @@ class ArmMotion(JawMotion):
         pose = self.postures.hand_pose(way.start[:JOINTS])
         goal = np.array(pose)
         slow = min(limits.speed, parameters.contact_speed)
+        if state.doubt > 0:
+            slow = min(slow, _CAREFUL_SPEED)
         way.speeds, way.yaw_speed = slow, limits.yaw_speed
         if mode in (Mode.DESCEND, Mode.LOWER):
             goal[2] = state.table_z + parameters.floor_clearance

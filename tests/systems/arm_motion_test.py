@@ -311,3 +311,19 @@ def test_a_tall_thing_matters_only_if_it_is_near_the_wrist(at_pick: float, is_po
     assert motion.prepare(state) == is_possible
     if not is_possible:
         assert "an object near the hand" in motion.reach_problem(state)
+
+
+@pytest.mark.parametrize("doubt", [0.0, 0.002])
+def test_the_arm_descends_more_slowly_if_the_heights_are_uncertain(doubt: float):
+    motion = motion_of()
+    state = motion.view(motion.initial_state())
+    set_action(state, (0.6, 0.3, 0.4), (0.5, -0.3, 0.0))
+    state.doubt = doubt
+    assert motion.prepare(state)
+    motion.begin(state, Mode.APPROACH, 0.0)
+    start = motion.arrival(state)
+    motion.begin(state, Mode.DESCEND, start)
+    z = fingertips(states(motion, state, start, motion.arrival(state))[:, :7])[:, 2]
+    speeds = -np.diff(z)[z[:-1] < 0.024] / 1e-3
+    allowed = 0.02 if doubt else PARAMETERS.contact_speed
+    assert 0.9 * allowed < speeds.max() < 1.05 * allowed
