@@ -165,8 +165,8 @@ class ArmPostures:
     def _problem_on_the_way(self, stops: Sequence[HandStop], way: list[NDArray[np.float64]]) -> str:
         share = np.linspace(0.0, 1.0, _CHECKED)[:, None]
         ways = [start + share * (end - start) for start, end in itertools.pairwise(way)]
-        highest = max(stops, key=lambda stop: stop.surface)
-        if not self.collision(np.concatenate(ways), highest.surface, highest=highest.highest):
+        top = max(stops, key=lambda stop: stop.surface)
+        if not self.collision(np.concatenate(ways), top.surface, highest=top.highest):
             return ""
         for stop, points in zip(stops, ways, strict=True):
             touched = self.collision(points, stop.surface, highest=stop.highest)

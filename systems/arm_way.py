@@ -116,7 +116,7 @@ class ArmWay:
         self._stopping, self._rest = self._stop.duration, self._stop.goal
         self.missing = 0.0
         """How far, in m, the hand or the held object sinks below the clear height on an `over`
-        path, where it should stay above."""
+        path, where it should stay above; zero or less if it does."""
         self._motion = self._plan(way, self._rest)
         self.duration = self._stopping + (self._motion.duration if self._motion else 0.0)
         self._accelerations = self._hand_accelerations()
