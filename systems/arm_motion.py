@@ -39,10 +39,10 @@ the same."""
 _RISES_WITHIN = 0.05
 """Within this horizontal distance of the pick, in m, the hand rises from it, or sinks to it."""
 _TOO_LOW = 0.010
-"""A motion on which the hand sinks below the clear height by more than this, in m, is not begun."""
+"""A motion is not begun if the hand would sink below the clear height by more than this, in m."""
 _CAREFUL_SPEED = 0.02
-"""Upper limit of `contact_speed` for an arm, in m/s, if the heights are uncertain: then it may touch
-something where nothing is expected."""
+"""Upper limit of `contact_speed` for an arm, in m/s, if the heights are uncertain: then it may
+touch something where nothing is expected."""
 _TOUCH_SPEED = 0.011
 """Upper limit of `touch_speed` for an arm, in m/s. The force of an impact is proportional to mass
 times speed. The mass that moves with an arm's hand is 10 to 25 kg; with the floating hand it is 4
