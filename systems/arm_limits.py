@@ -1,4 +1,4 @@
-"""Limits of the joints of Franka arms, as their maker publishes them."""
+"""Limits of the joints of Franka arms, as their maker publishes them, and the use of them."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 JOINTS = 7
+_ROUNDOFF = 1e-6
 
 _Seven = tuple[float, float, float, float, float, float, float]
 
@@ -100,3 +101,35 @@ section "Limits for Franka Research 3". libfranka 0.13 (`rate_limiting.h`) and f
 
 ARM_LIMITS = {"fr3": FR3, "panda": PANDA}
 """The limits of each arm, by the name of its model."""
+
+
+def limits_used(
+    samples: NDArray[np.float64], limits: ArmLimits, rate: float
+) -> tuple[tuple[str, float], ...]:
+    """For each kind of limit, its name and the largest fraction of it that a motion uses.
+
+    Args:
+        samples: (n, 21) joint positions, velocities and accelerations at a constant rate, in rad
+            and s.
+        limits: limits of the joints; those of the velocities may depend on the positions.
+        rate: rate of the samples, in Hz. At rates below 1 kHz the jerk is underestimated.
+    """
+    q, v, a = np.split(samples, 3, axis=1)
+    lower, upper = np.array(limits.lower), np.array(limits.upper)
+    position = np.abs(2 * (q - lower) / (upper - lower) - 1)
+    low, high = limits.velocity_bounds(q)
+    # Avoid 0 / 0 at the end of a joint's range, where the limit of velocity is zero.
+    velocity = np.where(v > 0, v, -v) / np.maximum(np.where(v > 0, high, -low), 1e-9)
+    jerk = np.abs(np.diff(a, axis=0)) * rate / limits.jerk
+    shares = {
+        "position": position,
+        "velocity": velocity,
+        "acceleration": np.abs(a) / limits.acceleration,
+        "jerk": jerk,
+    }
+    return tuple((name, _share(values)) for name, values in shares.items())
+
+
+def _share(values: NDArray[np.float64]) -> float:
+    largest = float(values.max(initial=0.0))
+    return 1.0 if 1.0 < largest < 1.0 + _ROUNDOFF else largest

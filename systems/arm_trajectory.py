@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from systems.arm_limits import JOINTS, ArmLimits
+from systems.arm_limits import JOINTS, limits_used
 from systems.arm_motion import ArmMotion, ArmState
 from systems.arm_way import WayVector
 from systems.motion_heights import motion_heights
@@ -18,7 +18,6 @@ from systems.signals import PickPlaceAction, SurfaceHeights
 FASTEST_RATE, SLOWEST_RATE = 1000, 200
 """Highest and lowest rate of a trajectory, in Hz. Franka's controller runs at 1 kHz. Below 200 Hz
 the interpolated motion would exceed the limits of acceleration by a few percent."""
-_ROUNDOFF = 1e-6
 
 
 @dataclass(frozen=True)
@@ -214,38 +213,6 @@ def plan_action(
         parameters.open_width,
         used,
     )
-
-
-def limits_used(
-    samples: NDArray[np.float64], limits: ArmLimits, rate: float
-) -> tuple[tuple[str, float], ...]:
-    """For each kind of limit, its name and the largest fraction of it that a motion uses.
-
-    Args:
-        samples: (n, 21) joint positions, velocities and accelerations at a constant rate, in rad
-            and s.
-        limits: limits of the joints; those of the velocities may depend on the positions.
-        rate: rate of the samples, in Hz. At rates below 1 kHz the jerk is underestimated.
-    """
-    q, v, a = np.split(samples, 3, axis=1)
-    lower, upper = np.array(limits.lower), np.array(limits.upper)
-    position = np.abs(2 * (q - lower) / (upper - lower) - 1)
-    low, high = limits.velocity_bounds(q)
-    # Avoid 0 / 0 at the end of a joint's range, where the limit of velocity is zero.
-    velocity = np.where(v > 0, v, -v) / np.maximum(np.where(v > 0, high, -low), 1e-9)
-    jerk = np.abs(np.diff(a, axis=0)) * rate / limits.jerk
-    shares = {
-        "position": position,
-        "velocity": velocity,
-        "acceleration": np.abs(a) / limits.acceleration,
-        "jerk": jerk,
-    }
-    return tuple((name, _share(values)) for name, values in shares.items())
-
-
-def _share(values: NDArray[np.float64]) -> float:
-    largest = float(values.max(initial=0.0))
-    return 1.0 if 1.0 < largest < 1.0 + _ROUNDOFF else largest
 
 
 def _set_action(

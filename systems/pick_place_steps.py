@@ -169,10 +169,11 @@ class PickPlaceSteps:
         state, time, hand, contact = moment.state, moment.time, moment.hand, moment.contact
         if time < self._motion.arrival(state) + self._settle:
             return
-        if self._is_held(hand, contact) and math.hypot(*contact[:2]) > _FIXED:
-            # The jaws also grip something that does not move, such as the wall of a kit.
+        is_held = self._is_held(hand, contact)
+        if is_held and math.hypot(*contact[:2]) > _FIXED:
+            # The jaws grip the wall of a kit, or press the object against it.
             self.stop(moment)
-        elif self._is_held(hand, contact):
+        elif is_held:
             state.hold_z, state.held_width = hand[2], hand[4] + hand[5]
             state.gentleness = state.trusts_grip = 0
             begin_lift(state, float(hand[2]))

@@ -61,9 +61,9 @@ def read_surface_heights(
     - Unseen pixels are filled in (`fill_unseen`).
     - An object's support is a low percentile of the heights around it. An object in the middle of
       others is thus assumed to stand on the same surface as the others.
-    - Tops are maxima over a few pixels, without lone peaks. The floor of a place is the minimum
-      over the seen pixels. If o_t is noisy, medians and percentiles are used instead, corrected for
-      their bias.
+    - Tops are maxima over a few pixels. The floor of a place is the minimum over the seen pixels.
+      If o_t is noisy, medians and percentiles are used instead, corrected for their bias.
+    - The highest surfaces, near a pose or anywhere, are found without lone peaks.
     - The table is assumed to be level and at the bottom of the grid. If it looks tilted or shifted
       in o_t, this counts as a calibration error, and `project` has subtracted it.
     - A table that looks more than 3 mm lower than expected is an exception: it is assumed to be

@@ -15,8 +15,7 @@ from pydrake.systems.framework import Context
 from kitting_drake.scenario.robots import FrankaArm
 from kitting_drake.station import KittingStation
 from kitting_drake.station.robot import ARM, HAND
-from systems.arm_limits import ARM_LIMITS, JOINTS
-from systems.arm_trajectory import limits_used
+from systems.arm_limits import ARM_LIMITS, JOINTS, limits_used
 
 _PALM = "hand"
 """Name of the hand's body that carries the fingers."""

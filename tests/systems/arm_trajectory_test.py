@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from systems.arm_kinematics import ArmBase
-from systems.arm_limits import ARM_LIMITS, FR3
+from systems.arm_limits import ARM_LIMITS, FR3, limits_used
 from systems.arm_motion import ArmMotion
-from systems.arm_trajectory import ArmTrajectory, limits_used, plan_action, quintic
+from systems.arm_trajectory import ArmTrajectory, plan_action, quintic
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import PickPlaceAction, PlanarPose, SurfaceHeights
 

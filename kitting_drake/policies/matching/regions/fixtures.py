@@ -110,7 +110,7 @@ def _fit_top(height: NDArray[np.float32], plateau: Mask) -> Plane:
         away = np.abs(values - design @ plane)
         weights = (away < PLANE_BAND) / np.maximum(away, _SAME_HEIGHT)
         weighted = design * weights[:, None]
-        plane = np.linalg.solve(weighted.T @ design, weighted.T @ values)
+        plane = np.linalg.lstsq(weighted.T @ design, weighted.T @ values, rcond=None)[0]
     return plane
 
 
