@@ -37,6 +37,10 @@ _SHARES = np.array([0.0, 0.25, 0.5, 0.75, 0.9, 1.0])[:, None, None]
 low, they are closer."""
 _PER_METRE = 30.0
 """A way on which the fingertips sink by a metre between its ends counts as slower by this, in s."""
+_PER_RADIAN = 1.0
+"""A posture from which a joint turns by a radian while the hand goes straight down counts as slower
+by this, in s. Near such postures the arm's mass at the fingertips is large, and so is the force of
+an impact."""
 _DEEPEST = 0.02
 """If possible, the fingertips sink by at most this between the ends of a way, in m."""
 _TILTS = (math.radians(2.0), math.radians(20.0), math.pi)
@@ -62,6 +66,18 @@ class HandStop:
     """Height of the highest surface below the wrist, in m."""
     highest: float | None = None
     """Height of the highest surface below forearm and elbow, in m; None for `surface`."""
+
+
+@dataclass(frozen=True)
+class _Option:
+    """A possible posture at a stop."""
+
+    half_turn: int
+    """Number of half turns of the jaws, 0 or 1."""
+    q: NDArray[np.float64]
+    """(7) joint positions at the height `high`, in rad."""
+    delay: float
+    """How much slower the posture counts because of the way down from it, in s."""
 
 
 class ArmPostures:
@@ -141,7 +157,7 @@ class ArmPostures:
             (7) joint positions for each stop, and a sentence that says why the arm cannot reach the
             stops. The sentence is empty if the arm can.
         """
-        options: list[list[tuple[int, NDArray[np.float64]]]] = []
+        options: list[list[_Option]] = []
         problem = ""
         for swivels, tilts in ((np.zeros(1), _TILTS[:1]), (_SWIVELS, _TILTS)):
             options = [
@@ -176,7 +192,7 @@ class ArmPostures:
 
     def _fastest(
         self,
-        options: list[list[tuple[int, NDArray[np.float64]]]],
+        options: list[list[_Option]],
         now: NDArray[np.float64],
         tilt: float,
     ) -> list[NDArray[np.float64]]:
@@ -188,10 +204,13 @@ class ArmPostures:
             ways = [(0.0, [now])]
             for found in options:
                 following = []
-                for turned, q in found:
-                    found_way = self._fastest_to(q, ways, tilt) if turned == half_turn else None
+                for option in found:
+                    if option.half_turn != half_turn:
+                        continue
+                    found_way = self._fastest_to(option.q, ways, tilt)
                     if found_way is not None:
-                        following.append(found_way)
+                        time, way = found_way
+                        following.append((time + option.delay, way))
                 ways = following
                 if not ways:
                     break
@@ -235,11 +254,8 @@ class ArmPostures:
         top = np.minimum(self._velocity, np.sqrt(way * self._acceleration))
         return np.asarray((way / np.maximum(top, 1e-9) + top / self._acceleration).max(-1))
 
-    def _options(
-        self, stop: HandStop, swivels: NDArray[np.float64]
-    ) -> list[tuple[int, NDArray[np.float64]]]:
-        """All possible postures at a stop, each as (number of half turns of the jaws, joint
-        positions at the height `high`)."""
+    def _options(self, stop: HandStop, swivels: NDArray[np.float64]) -> list[_Option]:
+        """All possible postures at a stop."""
         found = [
             (half_turn, way)
             for half_turn in (0, 1)
@@ -253,7 +269,10 @@ class ArmPostures:
 
         if found and touches(np.concatenate([way for _, way in found])):
             found = [item for item in found if not touches(item[1])]
-        return [(turned, way[-1]) for turned, way in found]
+        return [
+            _Option(turned, way[-1], _PER_RADIAN * float(np.abs(way[-1] - way[0]).max()))
+            for turned, way in found
+        ]
 
     def _is_continuous(self, way: NDArray[np.float64]) -> bool:
         """Whether the arm can move its hand straight down from the height `high` to `low`.

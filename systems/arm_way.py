@@ -34,6 +34,11 @@ _TRIES, _PATIENCE = 8, 3
 _ANY_ACCELERATION = 1e3
 """Acceleration of the yaw on a straight line, in rad/s^2. It is so large that only the joints'
 limits matter."""
+_LIGHT = 6.0
+"""If a joint moves more than this per metre of a straight line of the hand, in rad/m, the hand
+slows down where it may touch something."""
+_SLOWEST = 0.1
+"""The least factor by which it slows down."""
 _TOO_LOW = 0.001
 """If a path sinks below the clear height by more than this, in m, a higher one is tried."""
 _NEARLY_THERE = 0.02
@@ -214,6 +219,7 @@ class ArmWay:
         # point's.
         below = np.minimum(poses[:, 2], np.append(poses[1:, 2], poses[-1, 2]))
         limit = np.where(below < way.marks[1], slow, np.where(below < way.marks[0], middle, fast))
+        limit = np.where(limit > middle, limit, limit * _lightness(path))
         high = np.column_stack([np.repeat(limit[:, None], 3, 1), np.full(len(yaw), way.yaw_speed)])
         rows = np.column_stack([path.tips, yaw])
         acceleration = np.array([*[way.acceleration] * 3, _ANY_ACCELERATION])
@@ -286,6 +292,19 @@ class ArmWay:
         for _ in range(2):
             points = _averaged(points, max(half, 1))
         return _Path(points, self._postures.base.to_world(fingertips(points)))
+
+
+def _lightness(path: _Path) -> NDArray[np.float64]:
+    """(n) factors for the hand's speed along a path, at most 1, that keep the force of an impact
+    within bounds. Let r be the joints' way per way of the hand. The arm's mass m at the fingertips
+    grows as r^2, and the force of an impact at speed v as v sqrt(m)."""
+    turned = np.abs(np.diff(path.points[:, :-1], axis=0)).max(axis=1)
+    moved = np.linalg.norm(np.diff(path.tips, axis=0), axis=1)
+    # Where only the hand's yaw changes, its tips stay.
+    factor = np.ones(len(moved))
+    moves = turned > _LIGHT * moved
+    factor[moves] = np.maximum(_LIGHT * moved[moves] / turned[moves], _SLOWEST)
+    return np.append(factor, factor[-1])
 
 
 def _reach_below(q: NDArray[np.float64], reach: float) -> NDArray[np.float64]:

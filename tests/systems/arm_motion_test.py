@@ -327,3 +327,26 @@ def test_the_arm_descends_more_slowly_if_the_heights_are_uncertain(doubt: float)
     speeds = -np.diff(z)[z[:-1] < 0.024] / 1e-3
     allowed = 0.02 if doubt else PARAMETERS.contact_speed
     assert 0.9 * allowed < speeds.max() < 1.05 * allowed
+
+
+def test_where_the_joints_must_turn_far_to_lower_the_hand_it_sinks_more_slowly():
+    """The kinetic energy of the arm is what an unexpected contact must absorb."""
+    motion, rng = motion_of(), np.random.default_rng(5)
+    inertia = ArmInertia(arm_model(FrankaArm(model="fr3"))[0])
+    state = motion.view(motion.initial_state())
+    energies: list[float] = []
+    time = 1.0
+    while len(energies) < 6:
+        pick = (rng.uniform(0.4, 0.6), rng.uniform(0.1, 0.3), rng.uniform(-math.pi, math.pi))
+        place = (rng.uniform(0.3, 0.34), rng.uniform(-0.2, 0.2), rng.uniform(-math.pi, math.pi))
+        set_action(state, pick, place)
+        if not motion.prepare(state):
+            continue
+        for mode in (Mode.APPROACH, Mode.DESCEND, Mode.LIFT, Mode.LOWER):
+            motion.begin(state, mode, time)
+            time = motion.arrival(state)
+        lowering = states(motion, state, float(state.start_time), time)[::20]
+        near = lowering[fingertips(lowering[:, :7])[:, 2] < 0.05]
+        moving = zip(near[:, :7], near[:, 7:14], strict=True)
+        energies.append(max(float(v @ inertia.mass(q) @ v) / 2 for q, v in moving))
+    assert max(energies) < 0.004
