@@ -59,27 +59,33 @@ class ArmUseMeter:
         if not isinstance(robot, FrankaArm):
             raise ValueError("the station has no arm")
         self._station, self._limits = station, ARM_LIMITS[robot.model]
-        self._names = _collision_names(station.plant)
-        self._samples: list[NDArray[np.float64]] = []
+        plant = station.plant
+        self._names = _collision_names(plant)
+        self._ports = [station.GetOutputPort(name) for name in ("commanded", "robot_state")]
+        arm = plant.GetModelInstanceByName(ARM)
+        self._torque = plant.get_net_actuation_output_port(arm)
+        self._contact_torque = plant.get_generalized_contact_forces_output_port(arm)
+        self._contacts = plant.get_contact_results_output_port()
+        self._samples: list[tuple[float, NDArray, NDArray, NDArray]] = []
         self._collisions: dict[str, None] = {}
 
     def sample(self, root_context: Context) -> None:
         """Reads the arm's state, its targets, its torques and the contacts, in the context of the
         outermost Diagram."""
-        station = self._station
-        context = station.GetMyContextFromRoot(root_context)
-        ports = (station.GetOutputPort(name) for name in ("commanded", "robot_state", "actuation"))
-        desired, state, torque = (port.Eval(context) for port in ports)
-        time = [root_context.get_time()]
-        self._samples.append(np.concatenate([time, desired, state[:JOINTS], torque[:JOINTS]]))
+        context = self._station.GetMyContextFromRoot(root_context)
+        plant_context = self._station.plant.GetMyContextFromRoot(root_context)
+        desired, state = (port.Eval(context) for port in self._ports)
+        torque = self._torque.Eval(plant_context)
+        self._samples.append((root_context.get_time(), desired, state[:JOINTS], torque))
         # The contact results take long to compute, so do it only if something touches the arm.
-        if station.GetOutputPort("wrist_force").Eval(context).any():
-            for pair in self._touching(station.GetOutputPort("contact_results").Eval(context)):
+        if self._contact_torque.Eval(plant_context).any():
+            for pair in self._touching(self._contacts.Eval(plant_context)):
                 self._collisions.setdefault(pair)
 
     def result(self) -> ArmUse:
         """The largest shares and all collisions so far."""
-        samples = np.array(self._samples).reshape(-1, 1 + 5 * JOINTS)
+        samples = np.array([np.hstack(sample) for sample in self._samples])
+        samples = samples.reshape(-1, 1 + 5 * JOINTS)
         # After a pause, the first sample is a repetition.
         samples = samples[np.unique(samples[:, 0], return_index=True)[1], 1:]
         desired, measured, torque = np.split(samples, [3 * JOINTS, 4 * JOINTS], axis=1)
