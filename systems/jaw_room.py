@@ -1,4 +1,4 @@
-"""Measures the width of an object between the jaws from the observation o_t."""
+"""Measures, in the observation o_t, how much room the jaws and the palm have."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from systems.hand_geometry import FINGER_LENGTH, FINGERTIP_DEPTH, MAX_OPENING
+from systems.hand_geometry import FINGER_LENGTH, FINGERTIP_DEPTH, MAX_OPENING, PALM_SIZE
 from systems.signals import PixelGrid, PlanarPose
 
 _LEVEL = 0.3
@@ -56,3 +56,32 @@ def object_width(
     if reach > farthest or high[side:][half[side:] < reach].any():
         return math.inf
     return float(2 * half[side])
+
+
+def heights_below_palm(
+    height: NDArray[np.float32],
+    centres: NDArray[np.float64],
+    thetas: NDArray[np.float64],
+    resolution: float,
+    step: float = 1.0,
+) -> NDArray[np.float32]:
+    """Reads the heights below the palm, and up to a pixel beside it, at n poses of the hand.
+
+    Args:
+        height: (rows, cols) heights above the bottom of the grid, in m.
+        centres: (n, 2) row and column midway between the pads.
+        thetas: (n) the hand's angles, in rad. The palm's long side is across them.
+        resolution: side of a pixel, in m.
+        step: greatest distance of the points, in pixels.
+
+    Returns:
+        (n, k) heights at k points, in m. Points off the grid have the height of its nearest pixel.
+    """
+    halves = (side / 2 / resolution + 1.0 for side in PALM_SIZE)
+    u, s = (np.linspace(-half, half, math.ceil(2 * half / step) + 1) for half in halves)
+    u, s = (values.ravel() for values in np.meshgrid(u, s))
+    cos, sin = np.cos(thetas)[:, None], np.sin(thetas)[:, None]
+    row = np.rint(centres[:, :1] + cos * u - sin * s).astype(int)
+    col = np.rint(centres[:, 1:] + sin * u + cos * s).astype(int)
+    rows, cols = height.shape
+    return height[row.clip(0, rows - 1), col.clip(0, cols - 1)]

@@ -5,8 +5,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from systems.hand_geometry import PALM_HEIGHT
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import SurfaceHeights
+
+_PALM_ROOM = 0.0025
+"""Distance that the palm keeps from surfaces below it, in m."""
+_LEAST_DEPTH = 0.005
+"""The fingertips go at least this far below the object's top, in m, even if the palm has less
+room."""
 
 
 @dataclass(frozen=True)
@@ -29,8 +36,9 @@ def motion_heights(heights: SurfaceHeights, parameters: PickPlaceParameters) -> 
     """Computes the heights of a motion.
 
     The fingertips go below the object's top by a share of its height, within limits, and stay above
-    the table. At the pick, they are some distance above the surface on which the object stands. The
-    carried object extends below them by this distance.
+    the table. They grip higher if the palm would touch something. At the pick, they are some
+    distance above the surface on which the object stands. The carried object extends below them by
+    this distance.
 
     Args:
         heights: the heights of the surfaces, as `read_surface_heights` returns them.
@@ -39,7 +47,8 @@ def motion_heights(heights: SurfaceHeights, parameters: PickPlaceParameters) -> 
     floor = heights.table + parameters.floor_clearance
     share = parameters.grasp_depth_share * (heights.pick_top - heights.support)
     depth = max(parameters.grasp_depth, min(share, parameters.max_grasp_depth))
-    grasp = max(heights.pick_top - depth, floor)
+    room = heights.below_palm + _PALM_ROOM - PALM_HEIGHT
+    grasp = max(heights.pick_top - depth, floor, min(room, heights.pick_top - _LEAST_DEPTH))
     clear = heights.highest + parameters.travel_clearance
     hanging = max(grasp - heights.support, 0.0)
     return MotionHeights(

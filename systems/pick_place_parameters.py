@@ -86,7 +86,7 @@ class PickPlaceParameters:
     # If an object sticks out of its cavity, closed jaws press on its top with `press_force`, in N,
     # and go down from there by at most `press_depth`, in m. They touch the object at `touch_speed`;
     # the force overshoots a little.
-    press_force: float = bounded(28.0, 1.0, 140.0)
+    press_force: float = bounded(26.0, 1.0, 140.0)
     press_depth: float = bounded(0.020, 0.001, 0.05)
 
     # A vertical contact force that exceeds the payload's weight by more than this, in N, is a

@@ -230,6 +230,8 @@ class SurfaceHeights:
     """Height of the lowest surface at the place, on which the object will stand."""
     near_pick: float = 0.0
     """Height of the highest surface below the open jaws at the pick."""
+    below_palm: float = -math.inf
+    """Height of the highest surface below the palm at the pick; minus infinity if unknown."""
     near_place: float = 0.0
     """Height of the highest surface below the held object at the place."""
     highest: float = 0.0

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from systems.jaw_room import object_width
+from systems.jaw_room import heights_below_palm, object_width
 from systems.signals import Observation, PlanarPose, SurfaceHeights
 
 _PICK_REACH = 1
@@ -42,6 +42,8 @@ rim."""
 _NOISY_FLOOR_SHARE, _NOISY_FLOOR_BIAS = 25.0, -0.67
 """With noise, the floor's height is estimated as this percentile of the heights at the place, minus
 this many standard deviations of the noise."""
+_NOISY_PALM_SHARE = 98.0
+"""With noise, the highest surface below the palm is this percentile of the heights there."""
 _SUNK = 0.003
 """A table that looks lower than expected by more than this, in metres, is taken to be really lower.
 Any other deviation counts as a calibration error."""
@@ -107,6 +109,7 @@ def read_surface_heights(
         pick_top, place_rim = float(top.max(initial=0.0)), float(rim.max(initial=0.0))
         place_floor = float(floor.min())
     solid = _without_lone_peaks(height)
+    palm = heights_below_palm(solid, at_pick[None], np.array([pick.theta]), grid.resolution)
     around = [grid.z_min + _highest(solid, it, reach["wrist"]) for it in (at_pick, at_place)]
     sunk = [_sunk(observation, pixel) for pixel in (at_pick, at_place)]
     pick_z, place_z = (grid.z_min + value for value in sunk)
@@ -116,6 +119,7 @@ def read_surface_heights(
         place_rim=place_z + place_rim,
         place_floor=place_z + place_floor,
         near_pick=pick_z + _highest(solid, at_pick, reach["near_pick"]),
+        below_palm=pick_z + _percentile(palm, _NOISY_PALM_SHARE if noise else 100.0),
         near_place=place_z + _highest(solid, at_place, reach["near_place"]),
         highest=grid.z_min + float(solid.max(initial=0.0)),
         around_pick=around[0],

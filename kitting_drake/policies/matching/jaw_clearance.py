@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from kitting_drake.policies.matching.regions.segmentation import Region, Segmentation
-from systems.hand_geometry import FINGERTIP_DEPTH, PAD_LENGTH, PALM_HEIGHT, PALM_SIZE
+from systems.hand_geometry import FINGERTIP_DEPTH, PAD_LENGTH, PALM_HEIGHT
+from systems.jaw_room import heights_below_palm
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import PixelGrid, PlanarPose
 
@@ -217,9 +218,8 @@ def _grip(
     )
     fits &= contact > 0
     chosen = np.flatnonzero(fits)
-    fits[chosen] = _palm_is_free(
-        raised, centres[chosen], along[chosen], across[chosen], tip[chosen], resolution
-    )
+    below = heights_below_palm(raised, centres[chosen], thetas[chosen], resolution, step=3.0)
+    fits[chosen] = below.max(axis=1, initial=0.0) < tip[chosen] + PALM_HEIGHT - _LOWEST
     return [JawGrasp(centres[i], float(thetas[i]), float(cost[i])) for i in np.flatnonzero(fits)]
 
 
@@ -248,40 +248,6 @@ def _straightness(
         lean = np.nan_to_num(np.abs(_slope(u, low)) + np.abs(_slope(u, high)), nan=1.0)
         twist = np.nan_to_num(np.abs(_slope(u, low) + _slope(u, high)), nan=1.0)
     return touch.mean(axis=1), lean, twist
-
-
-def _palm_is_free(
-    raised: NDArray[np.float32],
-    centres: Array,
-    along: Array,
-    across: Array,
-    tip: Array,
-    resolution: float,
-) -> NDArray[np.bool_]:
-    """Returns whether, at each of n grasps, everything under the palm is lower than the palm.
-
-    Args:
-        raised: (rows, cols), heights above the table, in metres.
-        centres: (n, 2), row and column midway between the pads.
-        along: (n, 2), the direction of the pads' length.
-        across: (n, 2), the direction in which the jaws close.
-        tip: (n,), the height of the fingertips, in metres.
-        resolution: the side of a pixel, in metres.
-    """
-    u, s = (
-        np.linspace(-side / 2, side / 2, count)
-        for side, count in zip(PALM_SIZE, (7, 19), strict=True)
-    )
-    positions = (
-        centres[:, None, None]
-        + along[:, None, None] * (u / resolution)[:, None, None]
-        + across[:, None, None] * (s / resolution)[None, :, None]
-    )
-    index = np.moveaxis(np.rint(positions).astype(int), -1, 0)
-    rows, cols = raised.shape
-    row, col = np.clip(index[0], 0, rows - 1), np.clip(index[1], 0, cols - 1)
-    highest = raised[row, col].max(axis=(1, 2), initial=0.0)
-    return np.asarray(highest < tip + PALM_HEIGHT - _LOWEST)
 
 
 def _run(occupied: NDArray[np.bool_]) -> NDArray[np.intp]:
