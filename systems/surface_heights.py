@@ -131,15 +131,15 @@ def read_surface_heights(
 
 
 def _without_lone_peaks(height: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Heights (rows, cols) in which no pixel is higher than its `_NEIGHBOURS`-highest neighbour by
-    more than `_LONE`. Depth cameras put such pixels between the silhouette of a near body, such as
-    an arm, and what lies behind it."""
+    """Heights (rows, cols) in which each pixel that is higher than its `_NEIGHBOURS`-highest
+    neighbour by more than `_LONE` has that neighbour's height. Depth cameras put such pixels
+    between the silhouette of a near body, such as an arm, and what lies behind it."""
     from scipy import ndimage
 
     around = np.ones((3, 3), bool)
     around[1, 1] = False
     support = ndimage.rank_filter(height, -_NEIGHBOURS, footprint=around, mode="nearest")
-    return np.minimum(height, support + np.float32(_LONE))
+    return np.where(height > support + np.float32(_LONE), support, height)
 
 
 def _deviation(observation: Observation) -> float:

@@ -129,6 +129,8 @@ def test_a_lone_high_pixel_is_no_surface():
     seen = observation((PICK, 0.01, 0.03), (PlanarPose(0.60, -0.215), 0.01, 0.05))
     image = seen.image.copy()
     image[3, 70, 160] = 0.106 - GRID.z_min
+    row, col = np.rint(GRID.to_pixel((0.60, -0.215))).astype(int)
+    image[3, row, col] = 0.250 - GRID.z_min
     found = read_surface_heights(Observation(image, GRID), PICK, PLACE)
     assert found.highest == pytest.approx(0.05, abs=1e-6)
     # Six pixels are a surface.
