@@ -46,6 +46,10 @@ _FINGER_MARGIN = 0.003
 metres."""
 _STRAIGHT = 0.003
 """A part of the object's face that is recessed by less than this, in metres, touches the pad."""
+_SLIDES = 0.003
+"""A grasp is unsure if the closing jaws may push the object by more than this, in metres."""
+_UNSURE = 3.0
+"""The cost of an unsure grasp."""
 
 
 @dataclass(frozen=True)
@@ -57,8 +61,8 @@ class JawGrasp:
     theta: float
     """The gripper's angle in radians; adding pi gives the same grasp."""
     cost: float
-    """A dimensionless penalty for the distance from the object's centre and for faces that are not
-    parallel to the pads; 0 is best."""
+    """A dimensionless penalty for the distance from the object's centre, for faces that are not
+    parallel to the pads, and for jaws that may push the object; 0 is best."""
 
 
 def failed_pixels(grid: PixelGrid, failed_picks: Sequence[PlanarPose]) -> Array:
@@ -202,7 +206,8 @@ def _grip(
     if not fits.any():
         return []
 
-    contact, lean, twist = _straightness(occupied & own[:, None, :], s, u, left, right)
+    inside = occupied & own[:, None, :]
+    contact, lean, twist = _straightness(inside, s, u, left, right)
     centres = places + across * (shift / resolution)[:, None]
     arm = (centres - middle) * resolution
     lever = np.abs((arm * along).sum(axis=1))
@@ -214,6 +219,7 @@ def _grip(
         + 2.4 * (1 - contact)
         + 2.0 * lean
         + 4.0 * twist
+        + _UNSURE * _is_unsure(inside, s, left, right)
         + np.maximum(0.0, width - 0.035) / 0.015
     )
     fits &= contact > 0
@@ -241,13 +247,47 @@ def _straightness(
         (n,): how far both slope in the same direction: |left slope + right slope|. It is 0 for a
             wedge that lies symmetrically between the pads.
     """
-    low = np.where(inside.any(axis=2), s[inside.argmax(axis=2)], np.nan)
-    high = np.where(inside.any(axis=2), s[len(s) - 1 - inside[:, :, ::-1].argmax(axis=2)], np.nan)
+    low, high = _faces(inside, s)
     touch = (low < left[:, None] + _STRAIGHT) & (high > right[:, None] - _STRAIGHT)
     with np.errstate(invalid="ignore"):
         lean = np.nan_to_num(np.abs(_slope(u, low)) + np.abs(_slope(u, high)), nan=1.0)
         twist = np.nan_to_num(np.abs(_slope(u, low) + _slope(u, high)), nan=1.0)
     return touch.mean(axis=1), lean, twist
+
+
+def _is_unsure(inside: NDArray[np.bool_], s: Array, left: Array, right: Array) -> NDArray[np.bool_]:
+    """Returns whether the jaws of each of n grasps may push the object as they close.
+
+    A part of the object that only the end of a pad would touch may be missed. The pad then enters
+    a notch beside this part, and the jaws push the object until the faces that they do touch are
+    centred between them. So the faces on all lines are compared with those on the inner lines.
+
+    Args:
+        inside: (n, lines, samples) whether each sample is within the object.
+        s: (samples,), positions across the jaws, in metres.
+        left: (n,), the lowest s within the object.
+        right: (n,), the highest s within the object.
+    """
+    low, high = _faces(inside[:, 1:-1], s)
+    beyond = np.nan_to_num(low, nan=np.inf).min(axis=1) - left
+    before = np.nan_to_num(high, nan=-np.inf).max(axis=1) - right
+    touched = np.isfinite(beyond)
+    pushed = np.where(touched, beyond, 0.0) + np.where(touched, before, 0.0)
+    return ~touched | (np.abs(pushed) / 2 > _SLIDES)
+
+
+def _faces(inside: NDArray[np.bool_], s: Array) -> tuple[Array, Array]:
+    """Returns the lowest and the highest s within the object on each line, both (n, lines) and in
+    metres; NaN where a line misses the object.
+
+    Args:
+        inside: (n, lines, samples) whether each sample is within the object.
+        s: (samples,), positions across the jaws, in metres.
+    """
+    hit = inside.any(axis=2)
+    low = np.where(hit, s[inside.argmax(axis=2)], np.nan)
+    high = np.where(hit, s[len(s) - 1 - inside[:, :, ::-1].argmax(axis=2)], np.nan)
+    return low, high
 
 
 def _run(occupied: NDArray[np.bool_]) -> NDArray[np.intp]:

@@ -1,6 +1,7 @@
 """Grasps are found where o_t shows enough room for the jaws along the planner's motion."""
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -58,3 +59,24 @@ def test_the_tip_height_is_that_of_the_planner(planner: PickPlaceParameters, top
     expected = motion_heights(SurfaceHeights(pick_top=top), planner).grasp
     # `tip_height` stays at least 3 mm above the support.
     assert tip_height(np.array(top), 0.0, planner) == pytest.approx(max(expected, 0.003))
+
+
+def test_a_grasp_is_poor_if_the_pads_may_enter_a_notch():
+    """Pads as long as the notch is wide either touch the legs beside it, or enter it and push."""
+
+    def across_the_notch(columns: slice) -> list[float]:
+        """The costs of the grasps of a U, with the notch between its legs in given columns."""
+        image = np.zeros((4, *GRID.shape), np.float32)
+        image[3, 70:86, 100:120] = 0.02
+        image[3, 78:86, columns] = 0
+        segmentation = segment(Observation(image, GRID, np.ones(GRID.shape, bool)))
+        [item] = segmentation.objects
+        found = jaw_grasps(segmentation, item, GRID.resolution, PickPlaceParameters())
+        return [
+            grasp.cost
+            for grasp in found
+            if abs(grasp.pixel[1] - 109.5) < 4 and abs(math.cos(grasp.theta)) < 0.2
+        ]
+
+    assert min(across_the_notch(slice(107, 112))) > 5
+    assert min(across_the_notch(slice(106, 113))) < 1
