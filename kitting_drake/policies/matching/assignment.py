@@ -26,6 +26,9 @@ reversed."""
 _CLEARLY_BETTER = 0.75
 """An object counts as reversed only if its mirror image's mismatch with the recess is less than
 this share of the object's own mismatch."""
+_SYMMETRIC = 0.0012
+"""An object cannot be reversed if its outline differs from its mirror image by less than this, in
+metres. Without noise, pixels alone make them differ by up to 0.0012."""
 _PROMISING = 2.0
 """An object's outline is registered only to recesses whose `coarse_cost` is at most this many times
 the object's lowest `coarse_cost`."""
@@ -80,7 +83,7 @@ def reversed_objects(
     segmentation: Segmentation, pairs: Sequence[Pair], resolution: float
 ) -> tuple[int, ...]:
     """Finds the objects that lie upside down: the mirror images of their outlines fit free
-    recesses.
+    recesses. An object whose outline is its own mirror image is never one of them.
 
     Args:
         segmentation: the segmentation of an observation.
@@ -111,5 +114,7 @@ def reversed_objects(
         fit = register(outline, traced[j])
         better = mismatch(fit, mirrored, regions[j]) < _CLEARLY_BETTER * own
         if better and is_covered(outline, traced[j], fit):
-            found.append(i)
+            seen = trace_outline(item.mask, resolution, close=True)
+            if not is_covered(outline, seen, register(outline, seen), _SYMMETRIC):
+                found.append(i)
     return tuple(found)

@@ -277,14 +277,17 @@ def _spread(outline: Outline, recess: Outline, fit: Registration, away: Array) -
     return float(np.sqrt(variances[0] * arms + variances[1] + variances[2]))
 
 
-def is_covered(outline: Outline, recess: Outline, fit: Registration) -> bool:
+def is_covered(
+    outline: Outline, recess: Outline, fit: Registration, within: float = _WORST_REVERSE
+) -> bool:
     """Whether, after a fit, all of the recess's outline lies near the object's outline.
 
     `register` measures distances only from points of the object's outline, and clips them. So a
     box seems to fit into a longer cavity, or onto the visible remainder of a filled recess. The
-    distances of the recess's points from the object's outline show that such fits are poor.
+    distances of the recess's points from the object's outline show that such fits are poor. "Near"
+    means that their mean is less than `within`, in metres.
     """
-    return _reverse(outline, recess, fit) < _WORST_REVERSE
+    return _reverse(outline, recess, fit) < within
 
 
 def _reverse(outline: Outline, recess: Outline, fit: Registration) -> float:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from kitting_drake.policies.data.images import rotation_matrix
 from kitting_drake.policies.matching.inventory import Inventory
 from kitting_drake.policies.matching.separating import separating_action, turning_action
 from kitting_drake.policies.matching.shape_matching import ShapeMatchingPolicy
@@ -238,6 +239,26 @@ def test_an_object_on_its_wrong_face_is_turned_over_the_block_s_edge():
     assert min(abs(row - 19.5), abs(row - 109.5), abs(col - 19.5), abs(col - 109.5)) < 8
     assert ShapeMatchingPolicy(PLANNER)(wrong).reason == "nothing fits"
     assert ShapeMatchingPolicy(PLANNER, recover=True)(wrong).poses == action.poses
+
+
+def horseshoe(middle: tuple[float, float], angle: float, grown: float) -> NDArray[np.bool_]:
+    """The mask of a U of about 16 by 20 pixels, which is its own mirror image."""
+    offsets = np.stack(np.indices(GRID.shape), axis=-1) - middle
+    u, v = np.moveaxis(offsets @ rotation_matrix(angle), -1, 0)
+    back = (np.abs(u + 5) < 3.2 + grown) & (np.abs(v) < 10 + grown)
+    legs = (np.abs(np.abs(v) - 6.5) < 3.2 + grown) & (np.abs(u) < 8 + grown)
+    return np.asarray(back | legs)
+
+
+def test_an_object_that_is_its_own_mirror_image_is_never_reversed():
+    """In these pixels the mirror image happens to fit better than the object."""
+    height = scene((horseshoe((70.0, 200.1), -2.29, 0.35), 0.02)).height.copy()
+    height[20:110, 20:110] = 0.03
+    height[horseshoe((65.0, 65.1), -2.43, 0.2)] = 0.01
+    image = np.full((4, *GRID.shape), 0.5, np.float32)
+    image[3] = height
+    found = Inventory.of(Observation(image, GRID))
+    assert len(found.pairs) == 1 and not found.reversed_items
 
 
 def noisy(observation: Observation, deviation: float = 0.0015) -> Observation:
