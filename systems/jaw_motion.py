@@ -1,7 +1,5 @@
 """Computes the opening and the closing force of the jaws in each mode of the motion primitive."""
 
-import math
-
 from systems.hand_motion import ramp
 from systems.pick_place_parameters import Mode, PickPlaceParameters
 from systems.planner_state import PlannerState
@@ -12,10 +10,6 @@ _ROOM = 0.005
 
 class JawMotion:
     """Computes jaw openings and closing forces in all modes from the planner's state."""
-
-    settles = math.inf
-    """Infinite, so that `tare_settle` alone sets how long the hand rests before the payload is
-    tared; see `RobotMotion`."""
 
     def __init__(self, parameters: PickPlaceParameters) -> None:
         """
