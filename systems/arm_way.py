@@ -34,7 +34,7 @@ _TRIES, _PATIENCE = 8, 3
 _ANY_ACCELERATION = 1e3
 """Acceleration of the yaw on a straight line, in rad/s^2. It is so large that only the joints'
 limits matter."""
-_LIGHT = 6.0
+_LIGHT = 4.0
 """If a joint moves more than this per metre of a straight line of the hand, in rad/m, the hand
 slows down where it may touch something."""
 _SLOWEST = 0.1
