@@ -18,7 +18,7 @@ _PICK_CLEARANCE_REACH = 0.07
 """The open jaws stay within this distance of the pick, in metres."""
 _PLACE_CLEARANCE_REACH = 0.125
 """The held object stays within this distance of the place, in metres."""
-_WRIST_REACH = 0.2
+WRIST_REACH = 0.2
 """An arm's wrist stays within this distance of the hand, in metres."""
 _SUPPORT_REACH = 0.08
 """The object's support is searched for within this distance of the pick, in metres."""
@@ -85,7 +85,7 @@ def read_surface_heights(
             ("support", _SUPPORT_REACH),
             ("near_pick", _PICK_CLEARANCE_REACH),
             ("near_place", _PLACE_CLEARANCE_REACH),
-            ("wrist", _WRIST_REACH),
+            ("wrist", WRIST_REACH),
         )
     }
     height = observation.filled_height

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+import numpy as np
 from pydrake.math import RigidTransform
 
 from kitting_drake.common.errors import UserError
@@ -16,6 +17,7 @@ from systems.oracle_policy import gripper_pose
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.robot_motion import RobotMotion
 from systems.signals import PlanarPose, SurfaceHeights
+from systems.surface_heights import WRIST_REACH
 
 
 def check_scene_reach(scene: Scene, motion: RobotMotion, parameters: PickPlaceParameters) -> None:
@@ -113,18 +115,22 @@ def _stops(
         )
         heights = motion_heights(surfaces, parameters)
         at = PlanarPose(*(float(value) for value in pose.as_array()))
-        (pick, _) = hand_stops(at, at, heights, 0.0, parameters)
+        around = _highest(scene, at)
+        (pick, _) = hand_stops(at, at, heights, 0.0, parameters, (around, around))
         yield HandStop(name, pick.x, pick.y, pick.yaw, pick.low, pick.high, pick.surface)
 
 
-def _highest(scene: Scene) -> float:
+def _highest(scene: Scene, around: PlanarPose | None = None) -> float:
     """World z of the highest point of fixtures with cavities and of the objects that are present,
-    in m."""
+    in m. If `around` is given, only the parts of objects count that are below an arm's wrist when
+    the hand is there."""
     late = () if scene.arrivals is None else scene.arrivals.objects
-    tops = [
-        float((item.X_WB @ item.p_BPoints.T)[2].max())
-        for index, item in enumerate(scene.objects)
-        if index not in late
-    ]
+    present = [item for index, item in enumerate(scene.objects) if index not in late]
+    tops = np.concatenate(
+        [np.zeros((3, 1)), *(item.X_WB @ item.p_BPoints.T for item in present)], 1
+    )
+    if around is not None:
+        away = np.abs(tops[:2] - np.array([[around.x], [around.y]])).max(axis=0)
+        tops = tops[:, away <= WRIST_REACH]
     rims = [goal.highest or goal.rim_height for goal in scene.goals]
-    return max(0.0, *tops, *(rim for rim in rims if rim is not None))
+    return max(tops[2].max(initial=0.0), *(rim for rim in rims if rim is not None), 0.0)

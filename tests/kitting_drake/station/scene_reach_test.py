@@ -46,5 +46,19 @@ def test_what_alone_is_out_of_reach_is_named_and_no_error():
     check_scene_reach(scene, motion, found.planner)
 
 
+def test_a_tall_thing_matters_only_near_the_wrist():
+    found = scenario(0.1, 0.0)
+    scene = TASK.make_scene(grid=PixelGrid(), seed=3, base=BASE)
+    motion = make_motion(found)
+    hammer, ring = scene.objects
+    for away, is_possible in ((0.5, True), (0.1, False)):
+        x, y, _ = hammer.X_WB.translation()
+        tall = dataclasses.replace(ring, X_WB=_at(ring.X_WB, [x, y + away, 0.35]))
+        problems = scene_problems(
+            dataclasses.replace(scene, objects=(hammer, tall)), motion, found.planner
+        )
+        assert (not any(hammer.name in problem for problem in problems)) == is_possible
+
+
 def _at(X_WB, position):
     return type(X_WB)(X_WB.rotation(), position)
