@@ -252,7 +252,7 @@ class _Recorder:
         contact = parameters.contact_threshold
         self._mode(Mode.APPROACH)
         if state.press:
-            self._mode(Mode.DESCEND, stop_force=parameters.press_force)
+            self._mode(Mode.DESCEND, stop_force=parameters.press_stop_force)
             self._mode(Mode.RETREAT)
         else:
             self._mode(Mode.DESCEND, stop_force=contact)

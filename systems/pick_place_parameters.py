@@ -35,6 +35,10 @@ class Mode(enum.IntEnum):
     """Search for the cavity after a blocked insertion; see `InsertionSearch`."""
 
 
+_BRAKING = 4.0
+"""The force of a press rises by up to this, in N, while the hand brakes."""
+
+
 @dataclass
 class PickPlaceParameters:
     """Heights, speeds and thresholds of the motion primitive."""
@@ -83,10 +87,10 @@ class PickPlaceParameters:
     # A grasp counts as empty if the squeezing pads are closer to each other than this, in m.
     minimum_width: float = bounded(0.0005, 0.0, 0.08)
 
-    # If an object sticks out of its cavity, closed jaws press on its top with `press_force`, in N,
-    # and go down from there by at most `press_depth`, in m. They touch the object at `touch_speed`;
-    # the force overshoots a little.
-    press_force: float = bounded(26.0, 1.0, 140.0)
+    # If an object sticks out of its cavity, closed jaws press on its top with up to `press_force`,
+    # in N, and go down from there by at most `press_depth`, in m. They touch the object at
+    # `touch_speed`.
+    press_force: float = bounded(30.0, 1.0, 140.0)
     press_depth: float = bounded(0.020, 0.001, 0.05)
 
     # A vertical contact force that exceeds the payload's weight by more than this, in N, is a
@@ -142,6 +146,12 @@ class PickPlaceParameters:
 
     # The planner stops after this many actions; null stands for the task's own limit.
     max_actions: int | None = bounded(None, 0, 1000)
+
+    @property
+    def press_stop_force(self) -> float:
+        """The force at which the hand stops a press, in N. It is below `press_force`, because the
+        force still rises while the hand brakes."""
+        return max(self.press_force - _BRAKING, 0.5 * self.press_force)
 
     def motion_limits(self) -> dict[Mode, MotionLimits]:
         """The limits of each mode's motion."""

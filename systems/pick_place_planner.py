@@ -128,7 +128,7 @@ class PickPlacePlanner(LeafSystem):
       its place, the hand searches for the cavity. When the resistance ends, it lowers the object
       further.
     - An action with `press` consists of `APPROACH` and `DESCEND` with closed jaws. They touch the
-      object at `touch_speed` and press until `press_force` is reached.
+      object at `touch_speed` and press with up to `press_force`.
     - An action whose poses the robot cannot reach ends before anything moves, with the outcome
       "unreachable".
     - In all modes, a contact force beyond `force_limit` ends the action (see `ContactGuard`): the

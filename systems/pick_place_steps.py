@@ -143,7 +143,7 @@ class PickPlaceSteps:
         reached."""
         state, time, hand, contact = moment.state, moment.time, moment.hand, moment.contact
         if state.press:
-            if contact[2] > self._parameters.press_force:
+            if contact[2] > self._parameters.press_stop_force:
                 # Stop at once: during braking the hand would press harder.
                 self._motion.begin(state, Mode.RETREAT, time, z=hand[2])
             elif time >= self._motion.arrival(state):

@@ -46,6 +46,7 @@ class ActionLog:
         """
         self._station = station
         self._before: list[RigidTransform] = []
+        self._placed: list[bool] = []
         self._stopped = 0
         self.records: list[ActionRecord] = []
 
@@ -63,6 +64,8 @@ class ActionLog:
     def _follow(self, event: ModeChange) -> None:
         if event.is_action_start:
             self._before = self._station.object_poses(event.root_context)
+            placements = self._station.placements(event.root_context)
+            self._placed = [placement.strict_success for placement in placements]
             action = self._station.accepted_action(event.root_context)
             index = nearest_object(self._station, self._before, action.pick)
             self.records.append(self._record(index, action.pick, action.place))
@@ -115,6 +118,7 @@ class ActionLog:
             pick_angle_error_deg=None,
             place_position_error_mm=None,
             place_angle_error_deg=None,
+            was_placed=self._placed[index],
         )
         X_WB = self._before[index]
         best = [gripper_pose(X_WB, grasp) for grasp in scene_object.grasps]

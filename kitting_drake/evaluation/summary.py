@@ -38,6 +38,8 @@ symmetry."""
 _FAILED_GRASPS = ("missed", "dropped", "stopped")
 """The outcomes of actions that count as failed grasps: the grasp was missed or lost, or the force
 guard stopped the action."""
+_MOVES = ("placed", "dropped", "stopped", "set down")
+"""The outcomes of actions that may have moved an object."""
 
 ERRORS = ("add_s_mm", "position_error_mm", "angle_error_deg", "height_error_mm")
 """Keys of the errors of an object's final pose."""
@@ -114,6 +116,7 @@ def summarise(
         ],
         "actions": sum(episode["actions"] for episode in episodes),
         "needless_actions": sum(needless_actions(episode) for episode in episodes),
+        "repeated_moves": sum(repeated_moves(episode) for episode in episodes),
         "actions_after_failed_grasps": sum(map(actions_after_failed_grasp, episodes)),
         "missed_grasps": sum(episode["missed_grasps"] for episode in episodes),
         "dropped_objects": sum(episode["dropped_objects"] for episode in episodes),
@@ -180,6 +183,14 @@ def needless_actions(episode: Episode) -> int:
         # The result of a failed episode may have no objects.
         return 0
     return sum(action["object"] not in useful for action in episode["actions_taken"])
+
+
+def repeated_moves(episode: Episode) -> int:
+    """The number of actions that moved an object although it was placed, with strict success."""
+    return sum(
+        action.get("was_placed", False) and action["outcome"] in _MOVES
+        for action in episode["actions_taken"]
+    )
 
 
 def actions_after_failed_grasp(episode: Episode) -> int:

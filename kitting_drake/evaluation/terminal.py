@@ -195,6 +195,8 @@ def summary_notes(summary: dict[str, Any]) -> str:
             f"actions on objects that have no goal: {summary['needless_actions']} of "
             f"{summary['actions']}"
         )
+    if summary["repeated_moves"]:
+        lines.append(f"moved although placed: {summary['repeated_moves']} objects")
     if summary["moving_at_end"]:
         lines.append(f"still moving at the end: {summary['moving_at_end']} objects")
     return "\n".join(lines)

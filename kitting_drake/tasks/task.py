@@ -191,6 +191,8 @@ class ActionRecord:
     hand: 0 to 180 degrees."""
     peak_force_n: PeakForce | None = None
     """The largest contact force during the action; None until it is measured."""
+    was_placed: bool = False
+    """Whether the object already was a strict success when the action began."""
 
 
 class TaskConfig:

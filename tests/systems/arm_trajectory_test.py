@@ -103,7 +103,7 @@ def test_segments_and_jaws():
     pressed = plan(action=PRESS)
     assert [(it.mode, it.stop_force) for it in pressed.segments] == [
         ("APPROACH", None),
-        ("DESCEND", PARAMETERS.press_force),
+        ("DESCEND", PARAMETERS.press_stop_force),
         ("RETREAT", None),
     ]
     assert pressed.width_at(pressed.duration)[0] == 0.0

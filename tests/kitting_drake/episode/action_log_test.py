@@ -81,6 +81,20 @@ def test_the_right_action_has_no_error(station: KittingStation, index: int):
     assert record.place_angle_error_deg == pytest.approx(0.0, abs=1e-9)
 
 
+def test_an_action_on_a_placed_object_is_recorded_as_such(station: KittingStation):
+    pick, place = right_action(station, OBJECT)
+    (X_WGoal,) = station.scene.goals[OBJECT].poses
+    grasp = station.scene.objects[OBJECT].grasps[0]
+    action = Action(station, pick, place)
+    assert not action.record.was_placed
+    action.put(OBJECT, X_WGoal)
+    with pytest.MonkeyPatch.context() as patch:
+        again = PickPlaceAction(gripper_pose(X_WGoal, grasp), pick)
+        patch.setattr(station, "accepted_action", lambda _: again)
+        action.go(Mode.RETREAT, Mode.OBSERVE, Mode.APPROACH)
+    assert action.log.records[-1].was_placed
+
+
 def test_place_errors_are_those_of_the_arrival_pose(station: KittingStation):
     pick, place = right_action(station, OBJECT)
     # If the place moves with the grasp, the object still reaches its goal: only the pick is wrong.

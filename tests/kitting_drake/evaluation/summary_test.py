@@ -89,6 +89,18 @@ def test_needless_actions_are_counted():
     assert (summary["needless_actions"], summary["actions"]) == (2, 4)
 
 
+def test_objects_that_are_moved_although_placed_are_counted():
+    """A press and a missed grasp move nothing."""
+    episodes = [make_episode(0, [1.0, 1.0]), make_episode(1, [1.0, 1.0])]
+    for episode in episodes:
+        for action in episode["actions_taken"]:
+            action["was_placed"] = True
+    episodes[0]["actions_taken"][0]["outcome"] = "pressed"
+    episodes[0]["actions_taken"][1]["outcome"] = "missed"
+    episodes[1]["actions_taken"][0]["was_placed"] = False
+    assert summarised(episodes)["repeated_moves"] == 1
+
+
 def test_a_summary_holds_what_reproduces_it():
     summary = summarised([make_episode(0, [1.0])])
     assert summary["task"] == "kitting-seen-toolset"

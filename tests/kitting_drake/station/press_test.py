@@ -19,7 +19,7 @@ from tests.kitting_drake.rig import build_rig
 
 @pytest.mark.parametrize("force", [pytest.param(30.0, marks=pytest.mark.slow), 60.0])
 @pytest.mark.usefixtures("rendering")
-def test_a_press_reaches_the_press_force(monkeypatch: pytest.MonkeyPatch, force: float):
+def test_a_press_stops_just_below_the_press_force(monkeypatch: pytest.MonkeyPatch, force: float):
     """The bounds allow for the impact at `touch_speed` and a delay of one planner period."""
     action = PickPlaceAction(pick=PlanarPose(0.42, 0.14), press=True)
     monkeypatch.setitem(sys.modules, "presser", types.SimpleNamespace(press=lambda _: action))
@@ -40,4 +40,4 @@ def test_a_press_reaches_the_press_force(monkeypatch: pytest.MonkeyPatch, force:
     simulator = Simulator(rig.diagram)
     simulator.set_monitor(watch)
     simulator.AdvanceTo(3.0)
-    assert force < peak < force + 8
+    assert force - 5 < peak < force + 4
