@@ -284,6 +284,7 @@ class ArmMotion(JawMotion):
             goal[:2] = state.place[0] + x, state.place[1] + y
             goal[3] = state.place[2] + yaw
             goal[2] = state.touch_z - parameters.search.press
+            way.marks = math.inf, -math.inf
         elif at is not None:
             if np.linalg.norm(at[:3] - pose[:3]) > _FARTHEST_STOP:
                 return

@@ -144,8 +144,9 @@ class ArmPostures:
     def choose(
         self, stops: Sequence[HandStop], now: NDArray[np.float64]
     ) -> tuple[list[NDArray[np.float64]], str]:
-        """Chooses a posture at the height `high` of each stop. The whole motion is kept short, and
-        the hand tilts as little as possible between two stops.
+        """Chooses a posture at the height `high` of each stop. The whole motion is kept short, the
+        hand tilts as little as possible between two stops, and the joints turn little while it goes
+        down.
 
         The jaws are symmetric, so the yaws may be turned by pi, but only at all stops together.
 

@@ -35,10 +35,10 @@ _ANY_ACCELERATION = 1e3
 """Acceleration of the yaw on a straight line, in rad/s^2. It is so large that only the joints'
 limits matter."""
 _LIGHT = 4.0
-"""If a joint moves more than this per metre of a straight line of the hand, in rad/m, the hand
-slows down where it may touch something."""
+"""If one of the joints 1 to 6 turns by more than this per metre of a straight line of the hand, in
+rad/m, the hand moves more slowly below the first mark of the line, and in a search."""
 _SLOWEST = 0.1
-"""The least factor by which it slows down."""
+"""The least factor by which the hand slows down."""
 _TOO_LOW = 0.001
 """If a path sinks below the clear height by more than this, in m, a higher one is tried."""
 _NEARLY_THERE = 0.02
@@ -67,8 +67,8 @@ class WayVector(VectorView):
     line = Array(4)
     """Goal of a straight line of the hand: x, y, z, yaw in the world."""
     marks = Array(2)
-    """Two heights on the line. The hand slows down below the first, and once more below the
-    second."""
+    """Two heights on the line. The hand slows down below the first, where it may touch something,
+    and once more below the second."""
     speeds = Array(3)
     """Largest speeds of the hand on the line: above the marks, between them, and below them."""
     yaw_speed = Number()
@@ -219,7 +219,7 @@ class ArmWay:
         # point's.
         below = np.minimum(poses[:, 2], np.append(poses[1:, 2], poses[-1, 2]))
         limit = np.where(below < way.marks[1], slow, np.where(below < way.marks[0], middle, fast))
-        limit = np.where(limit > middle, limit, limit * _lightness(path))
+        limit = np.where(below < way.marks[0], limit * _lightness(path), limit)
         high = np.column_stack([np.repeat(limit[:, None], 3, 1), np.full(len(yaw), way.yaw_speed)])
         rows = np.column_stack([path.tips, yaw])
         acceleration = np.array([*[way.acceleration] * 3, _ANY_ACCELERATION])
@@ -295,12 +295,12 @@ class ArmWay:
 
 
 def _lightness(path: _Path) -> NDArray[np.float64]:
-    """(n) factors for the hand's speed along a path, at most 1, that keep the force of an impact
-    within bounds. Let r be the joints' way per way of the hand. The arm's mass m at the fingertips
-    grows as r^2, and the force of an impact at speed v as v sqrt(m)."""
+    """(n) factors from `_SLOWEST` to 1 for the hand's speed along a path, which make impacts
+    gentler. Let r be how far the joints turn per way of the hand. The arm's mass m at the
+    fingertips grows as r^2, and the force of an impact at speed v as v sqrt(m)."""
     turned = np.abs(np.diff(path.points[:, :-1], axis=0)).max(axis=1)
     moved = np.linalg.norm(np.diff(path.tips, axis=0), axis=1)
-    # Where only the hand's yaw changes, its tips stay.
+    # Avoid 0/0 where neither moves.
     factor = np.ones(len(moved))
     moves = turned > _LIGHT * moved
     factor[moves] = np.maximum(_LIGHT * moved[moves] / turned[moves], _SLOWEST)

@@ -65,7 +65,7 @@ def heights_below_palm(
     resolution: float,
     step: float = 1.0,
 ) -> NDArray[np.float32]:
-    """Reads the heights below the palm, and up to a pixel beside it, at n poses of the hand.
+    """Samples the heights below the palm, and up to a pixel beside it, at n poses of the hand.
 
     Args:
         height: (rows, cols) heights above the bottom of the grid, in m.

@@ -12,8 +12,8 @@ from systems.signals import SurfaceHeights
 _PALM_ROOM = 0.0025
 """Distance that the palm keeps from surfaces below it, in m."""
 _LEAST_DEPTH = 0.005
-"""The fingertips go at least this far below the object's top, in m, even if the palm has less
-room."""
+"""If the fingertips would be less far than this below the object's top, in m, the hand does not
+grip higher for the palm's sake."""
 
 
 @dataclass(frozen=True)
@@ -47,8 +47,10 @@ def motion_heights(heights: SurfaceHeights, parameters: PickPlaceParameters) -> 
     floor = heights.table + parameters.floor_clearance
     share = parameters.grasp_depth_share * (heights.pick_top - heights.support)
     depth = max(parameters.grasp_depth, min(share, parameters.max_grasp_depth))
+    grasp = max(heights.pick_top - depth, floor)
     room = heights.below_palm + _PALM_ROOM - PALM_HEIGHT
-    grasp = max(heights.pick_top - depth, floor, min(room, heights.pick_top - _LEAST_DEPTH))
+    if room <= heights.pick_top - _LEAST_DEPTH:
+        grasp = max(grasp, room)
     clear = heights.highest + parameters.travel_clearance
     hanging = max(grasp - heights.support, 0.0)
     return MotionHeights(

@@ -58,7 +58,7 @@ class PickPlaceParameters:
 
     # The fingertips go below the object's top by `grasp_depth_share` of its height, but by at least
     # `grasp_depth` and at most `max_grasp_depth`, in m. On a round handle the pads should be near
-    # the widest section.
+    # the widest section. Where the palm has too little room the hand grips higher.
     grasp_depth: float = bounded(0.010, 0.001, 0.05)
     max_grasp_depth: float = bounded(0.018, 0.001, 0.05)
     grasp_depth_share: float = bounded(0.4, 0.0, 1.0)
@@ -139,8 +139,8 @@ class PickPlaceParameters:
     # is released slowly swings about the pads.
     force_ramp: float = bounded(0.03, 0.0, 5.0)
 
-    # How long the hand rests before the cameras look (`observe_settle`) and before the payload is
-    # tared (`tare_settle`), in s.
+    # How long the hand rests before the cameras look (`observe_settle`), and at most before it
+    # checks its grip or tares the payload (`tare_settle`), in s.
     observe_settle: float = bounded(0.10, 0.0, 10.0)
     tare_settle: float = bounded(0.10, 0.0, 10.0)
 

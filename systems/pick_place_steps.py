@@ -31,9 +31,9 @@ _HOLDING = (Mode.CHECK, Mode.LIFT, Mode.CARRY, Mode.LOWER, Mode.SEARCH, Mode.REL
 _STEADY = 0.6
 """An object has turned if its lever (see `felt_lever`) falls below this fraction of its earlier
 value."""
-_STALLED = 0.01
-"""The jaws have stalled when they close more slowly than this, in m/s. A tenth of their usual speed
-is what soft pads yield while the force builds up."""
+_STALLED = 0.1
+"""The jaws have stalled when they close at less than this share of the commanded speed. Soft pads
+still yield more slowly than that while the force builds up."""
 _FIXED = 20.0
 """If the closed jaws feel a lateral force above this at rest, in N, they grip something fixed."""
 _STUCK = 0.004
@@ -139,8 +139,8 @@ class PickPlaceSteps:
             self._motion.begin(state, following, time)
 
     def descend(self, moment: Moment) -> None:
-        """Moves down until contact. An action that presses goes on until the press force is
-        reached."""
+        """Moves down until contact. An action that presses goes on until the force reaches
+        `press_stop_force`."""
         state, time, hand, contact = moment.state, moment.time, moment.hand, moment.contact
         if state.press:
             if contact[2] > self._parameters.press_stop_force:
@@ -163,7 +163,8 @@ class PickPlaceSteps:
         # Stalled jaws lag behind their command by the force divided by the stiffness of the
         # fingers' control.
         commanded, _ = self._motion.opening_at(state, time)
-        stalled = moving_for > 0.1 and abs(rate) < _STALLED and commanded < opening - 1e-3
+        slow = abs(rate) < _STALLED * 2 * self._parameters.finger_speed
+        stalled = moving_for > 0.1 and slow and commanded < opening - 1e-3
         if stalled or commanded <= 0.0:
             self._motion.begin(state, Mode.CHECK, time, opening=opening)
 

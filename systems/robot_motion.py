@@ -22,8 +22,9 @@ class RobotMotion(Protocol):
     size: int
     """Number of elements of the vector that `motion_at` returns."""
     settles: float
-    """Time after the end of a motion until the hand no longer vibrates. The hand rests for this
-    time, or for `tare_settle` if that is shorter, before it measures forces."""
+    """Time after the end of a motion until the hand no longer vibrates, in s. The hand rests for
+    this time, or for `tare_settle` if that is shorter, before it checks its grip or tares the
+    payload."""
 
     def initial_state(self) -> NDArray[np.float64]:
         """A state in which the hand waits at home with open jaws."""

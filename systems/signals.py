@@ -231,7 +231,8 @@ class SurfaceHeights:
     near_pick: float = 0.0
     """Height of the highest surface below the open jaws at the pick."""
     below_palm: float = -math.inf
-    """Height of the highest surface below the palm at the pick; minus infinity if unknown."""
+    """Height of the highest surface below the palm at the pick, or nearly the highest if o_t has
+    noise; minus infinity if unknown."""
     near_place: float = 0.0
     """Height of the highest surface below the held object at the place."""
     highest: float = 0.0

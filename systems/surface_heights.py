@@ -50,6 +50,8 @@ Any other deviation counts as a calibration error."""
 _LONE, _NEIGHBOURS = 0.02, 4
 """A pixel shows a surface only if at least `_NEIGHBOURS` of its neighbours are higher than it, or
 lower by at most `_LONE`, in metres."""
+_SPIKE = 0.06
+"""Nothing so thin stands higher than this above its neighbours, in metres."""
 _TILT_DOUBT, _MOST_DOUBT = 0.3, 0.0025
 """The uncertainty of heights is the noise plus `_TILT_DOUBT` times the table's deviation before
 levelling. This sum is limited to `_MOST_DOUBT`, in metres."""
@@ -131,15 +133,18 @@ def read_surface_heights(
 
 
 def _without_lone_peaks(height: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Heights (rows, cols) in which each pixel that is higher than its `_NEIGHBOURS`-highest
-    neighbour by more than `_LONE` has that neighbour's height. Depth cameras put such pixels
-    between the silhouette of a near body, such as an arm, and what lies behind it."""
+    """Heights (rows, cols) in which no pixel is higher than its `_NEIGHBOURS`-highest neighbour by
+    more than `_LONE`. A pixel that is higher by more than `_SPIKE` gets that neighbour's height.
+
+    Depth cameras put such pixels between the silhouette of a near body, such as an arm, and what
+    lies behind it."""
     from scipy import ndimage
 
     around = np.ones((3, 3), bool)
     around[1, 1] = False
     support = ndimage.rank_filter(height, -_NEIGHBOURS, footprint=around, mode="nearest")
-    return np.where(height > support + np.float32(_LONE), support, height)
+    is_spike = height > support + np.float32(_SPIKE)
+    return np.where(is_spike, support, np.minimum(height, support + np.float32(_LONE)))
 
 
 def _deviation(observation: Observation) -> float:

@@ -186,7 +186,8 @@ def needless_actions(episode: Episode) -> int:
 
 
 def repeated_moves(episode: Episode) -> int:
-    """The number of actions that moved an object although it was placed, with strict success."""
+    """The number of actions that may have moved an object although it was placed, with strict
+    success."""
     return sum(
         action.get("was_placed", False) and action["outcome"] in _MOVES
         for action in episode["actions_taken"]

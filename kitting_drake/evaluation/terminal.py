@@ -196,7 +196,7 @@ def summary_notes(summary: dict[str, Any]) -> str:
             f"{summary['actions']}"
         )
     if summary["repeated_moves"]:
-        lines.append(f"moved although placed: {summary['repeated_moves']} objects")
+        lines.append(f"actions that moved a placed object: {summary['repeated_moves']}")
     if summary["moving_at_end"]:
         lines.append(f"still moving at the end: {summary['moving_at_end']} objects")
     return "\n".join(lines)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable
 
 import numpy as np
@@ -117,7 +118,7 @@ def _stops(
         at = PlanarPose(*(float(value) for value in pose.as_array()))
         around = _highest(scene, at)
         (pick, _) = hand_stops(at, at, heights, 0.0, parameters, (around, around))
-        yield HandStop(name, pick.x, pick.y, pick.yaw, pick.low, pick.high, pick.surface)
+        yield dataclasses.replace(pick, name=name)
 
 
 def _highest(scene: Scene, around: PlanarPose | None = None) -> float:

@@ -192,7 +192,7 @@ class ActionRecord:
     peak_force_n: PeakForce | None = None
     """The largest contact force during the action; None until it is measured."""
     was_placed: bool = False
-    """Whether the object already was a strict success when the action began."""
+    """Whether the object was already a strict success when the action began."""
 
 
 class TaskConfig:

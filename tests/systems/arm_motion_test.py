@@ -329,6 +329,33 @@ def test_the_arm_descends_more_slowly_if_the_heights_are_uncertain(doubt: float)
     assert 0.9 * allowed < speeds.max() < 1.05 * allowed
 
 
+def test_postures_from_which_the_joints_turn_little_are_preferred(monkeypatch: pytest.MonkeyPatch):
+    motion, rng = motion_of(), np.random.default_rng(5)
+    state = motion.view(motion.initial_state())
+
+    def turn(stop: HandStop) -> float:
+        """How far a joint turns while the hand sinks at the chosen posture, in rad."""
+        (high,), problem = motion.postures.choose([stop], motion.home_joints)
+        assert not problem
+        down = np.linspace(stop.high, stop.low, 20)
+        poses = np.array([[stop.x, stop.y, z, motion.postures.hand_pose(high)[3]] for z in down])
+        return float(np.ptp(motion.postures.along(poses, high), axis=0).max())
+
+    gains = []
+    while len(gains) < 7:
+        place = (rng.uniform(0.3, 0.34), rng.uniform(-0.2, 0.2), rng.uniform(-math.pi, math.pi))
+        set_action(state, (0.5, 0.2, 0.0), place)
+        if not motion.prepare(state):
+            continue
+        stop = motion.stops(state)[-1]
+        preferred = turn(stop)
+        with monkeypatch.context() as patch:
+            patch.setattr("systems.arm_postures._PER_RADIAN", 0.0)
+            gains.append(turn(stop) - preferred)
+    assert min(gains) > -1e-9
+    assert np.mean(gains) > 0.02
+
+
 def test_where_the_joints_must_turn_far_to_lower_the_hand_it_sinks_more_slowly():
     """The kinetic energy of the arm is what an unexpected contact must absorb."""
     motion, rng = motion_of(), np.random.default_rng(5)

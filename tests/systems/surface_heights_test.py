@@ -4,7 +4,7 @@ import pytest
 from systems.hand_geometry import PALM_HEIGHT
 from systems.motion_heights import motion_heights
 from systems.pick_place_parameters import PickPlaceParameters
-from systems.signals import Observation, PixelGrid, PlanarPose
+from systems.signals import Observation, PixelGrid, PlanarPose, SurfaceHeights
 from systems.surface_heights import read_surface_heights
 from systems.table_plane import level
 
@@ -146,15 +146,20 @@ def test_what_is_far_from_the_wrist_is_not_around_it():
     assert found.around_place == found.highest == pytest.approx(0.12, abs=1e-6)
 
 
-@pytest.mark.parametrize(("turn", "is_below_palm"), [(0.0, True), (np.pi / 2, False)])
+@pytest.mark.parametrize(
+    ("turn", "kit_height", "grips_higher"),
+    [(0.0, 0.05, True), (np.pi / 2, 0.05, False), (0.0, 0.07, False)],
+)
 def test_a_flat_object_beside_a_kit_is_gripped_so_high_that_the_palm_clears_the_kit(
-    turn: float, is_below_palm: bool
+    turn: float, kit_height: float, grips_higher: bool
 ):
-    """The palm reaches 0.1 m to the sides in the direction in which the jaws close."""
+    """The palm reaches 0.1 m to the sides in the direction in which the jaws close. Beside a kit
+    that is too high for the palm, a higher grip would be of no use."""
     kit = PlanarPose(PICK.x, PICK.y - 0.14)
-    seen = observation((PICK, 0.01, 0.012), (kit, 0.05, 0.05))
+    seen = observation((PICK, 0.01, 0.012), (kit, 0.05, kit_height))
     found = read_surface_heights(seen, PlanarPose(PICK.x, PICK.y, turn), PLACE)
+    usual = motion_heights(SurfaceHeights(pick_top=0.012), PickPlaceParameters()).grasp
     grasp = motion_heights(found, PickPlaceParameters()).grasp
-    assert found.below_palm == pytest.approx(0.05 if is_below_palm else 0.012, abs=1e-6)
-    assert (grasp + PALM_HEIGHT > 0.052) == is_below_palm
-    assert grasp <= 0.012 - 0.005 + 1e-6
+    assert found.below_palm == pytest.approx(0.012 if turn else kit_height, abs=1e-6)
+    assert (grasp > usual + 1e-6) == grips_higher
+    assert (grasp + PALM_HEIGHT > kit_height + 0.002) == grips_higher

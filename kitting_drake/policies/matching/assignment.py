@@ -83,7 +83,7 @@ def reversed_objects(
     segmentation: Segmentation, pairs: Sequence[Pair], resolution: float
 ) -> tuple[int, ...]:
     """Finds the objects that lie upside down: the mirror images of their outlines fit free
-    recesses. An object whose outline is its own mirror image is never one of them.
+    recesses. An object whose outline is nearly its own mirror image is never one of them.
 
     Args:
         segmentation: the segmentation of an observation.

@@ -49,7 +49,7 @@ _STRAIGHT = 0.003
 _SLIDES = 0.003
 """A grasp is unsure if the closing jaws may push the object by more than this, in metres."""
 _UNSURE = 3.0
-"""The cost of an unsure grasp."""
+"""What `JawGrasp.rank` adds to the cost of an unsure grasp."""
 
 
 @dataclass(frozen=True)
@@ -61,8 +61,15 @@ class JawGrasp:
     theta: float
     """The gripper's angle in radians; adding pi gives the same grasp."""
     cost: float
-    """A dimensionless penalty for the distance from the object's centre, for faces that are not
-    parallel to the pads, and for jaws that may push the object; 0 is best."""
+    """A dimensionless penalty for the distance from the object's centre and for faces that are not
+    parallel to the pads; 0 is best."""
+    is_unsure: bool = False
+    """Whether the closing jaws may push the object."""
+
+    @property
+    def rank(self) -> float:
+        """The cost, plus a penalty if the grasp is unsure. Grasps are chosen by it."""
+        return self.cost + _UNSURE * self.is_unsure
 
 
 def failed_pixels(grid: PixelGrid, failed_picks: Sequence[PlanarPose]) -> Array:
@@ -117,7 +124,7 @@ def jaw_grasps(
 
     def grip(places: Array, thetas: Array) -> list[JawGrasp]:
         found = _grip(relief, places, thetas, middle, resolution, planner, support)
-        return sorted(_seen(found, segmentation, planner), key=lambda item: item.cost)
+        return sorted(_seen(found, segmentation, planner), key=lambda item: item.rank)
 
     thetas = np.arange(_ANGLES) * math.pi / _ANGLES
     place, theta = (item.ravel() for item in np.meshgrid(np.arange(len(places)), thetas))
@@ -128,7 +135,7 @@ def jaw_grasps(
     best = found[0]
     nearby = best.theta + np.radians(np.linspace(-4, 4, 9))
     refined = grip(np.repeat(best.pixel[None], len(nearby), axis=0), nearby)
-    return sorted([*refined, *found], key=lambda item: item.cost)
+    return sorted([*refined, *found], key=lambda item: item.rank)
 
 
 def _seen(
@@ -146,7 +153,8 @@ def _seen(
 def tip_height(top: Array, support: float, planner: PickPlaceParameters) -> Array:
     """Returns the height of the fingertips above the table at a grasp, in metres.
 
-    It is the grasp height of `motion_heights`, raised if needed to clear the object's support.
+    It is the grasp height of `motion_heights` where the palm has room, raised if needed to clear
+    the object's support.
 
     Args:
         top: the height of the object's top, in metres above the table.
@@ -219,14 +227,17 @@ def _grip(
         + 2.4 * (1 - contact)
         + 2.0 * lean
         + 4.0 * twist
-        + _UNSURE * _is_unsure(inside, s, left, right)
         + np.maximum(0.0, width - 0.035) / 0.015
     )
     fits &= contact > 0
     chosen = np.flatnonzero(fits)
     below = heights_below_palm(raised, centres[chosen], thetas[chosen], resolution, step=3.0)
     fits[chosen] = below.max(axis=1, initial=0.0) < tip[chosen] + PALM_HEIGHT - _LOWEST
-    return [JawGrasp(centres[i], float(thetas[i]), float(cost[i])) for i in np.flatnonzero(fits)]
+    unsure = _is_unsure(inside, s, left, right)
+    return [
+        JawGrasp(centres[i], float(thetas[i]), float(cost[i]), bool(unsure[i]))
+        for i in np.flatnonzero(fits)
+    ]
 
 
 def _straightness(

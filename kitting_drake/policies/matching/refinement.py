@@ -57,9 +57,9 @@ many metres."""
 _FARTHEST_GRASP = 0.04
 """A refined grasp is at most this far from the predicted one, in metres."""
 _POOR = 0.03
-"""When grasps are compared, a grasp cost of one counts as much as a shift by this many metres."""
+"""When grasps are compared, a rank of one counts as much as a shift by this many metres."""
 _MUCH_WORSE = 0.5
-"""A predicted grasp is replaced only if its `JawGrasp.cost` exceeds that of the best grasp nearby
+"""A predicted grasp is replaced only if its `JawGrasp.rank` exceeds that of the best grasp nearby
 by at least this."""
 _SAME_PLACE = 0.008
 """Two grasps with similar angles count as the same if they are closer than this, in metres."""
@@ -255,7 +255,7 @@ def refine_grasp(
 
     def departure(grasp: JawGrasp) -> float:
         distance, turned = away(grasp)
-        return distance + _LEVER * turned + _POOR * grasp.cost
+        return distance + _LEVER * turned + _POOR * grasp.rank
 
     grasps = jaw_grasps(segmentation, taken, resolution, planner, balance=balance)
     if balance is not None:
@@ -264,11 +264,12 @@ def refine_grasp(
     near = [grasp for grasp in grasps if away(grasp)[0] <= _FARTHEST_GRASP]
     if failed is not None:
         near = untried(near, failed, resolution)
-    least = min((grasp.cost for grasp in near), default=math.inf)
+    least = min((grasp.rank for grasp in near), default=math.inf)
     # The network takes more into account than the cost does, so keep the network's grasp unless
     # another grasp costs much less.
-    same = min((g.cost for g in grasps if is_same(*away(g))), default=None)
-    if same is not None and same < least + _MUCH_WORSE:
-        return RefinedGrasp(pick, theta, same)
+    # The grasps are sorted by rank.
+    same = next((grasp for grasp in grasps if is_same(*away(grasp))), None)
+    if same is not None and same.rank < least + _MUCH_WORSE:
+        return RefinedGrasp(pick, theta, same.cost)
     best = min(near, key=departure, default=None)
     return None if best is None else RefinedGrasp(best.pixel, best.theta, best.cost)

@@ -65,7 +65,7 @@ def test_a_grasp_is_poor_if_the_pads_may_enter_a_notch():
     """Pads as long as the notch is wide either touch the legs beside it, or enter it and push."""
 
     def across_the_notch(columns: slice) -> list[float]:
-        """The costs of the grasps of a U, with the notch between its legs in given columns."""
+        """The ranks of the grasps of a U, with the notch between its legs in given columns."""
         image = np.zeros((4, *GRID.shape), np.float32)
         image[3, 70:86, 100:120] = 0.02
         image[3, 78:86, columns] = 0
@@ -73,7 +73,7 @@ def test_a_grasp_is_poor_if_the_pads_may_enter_a_notch():
         [item] = segmentation.objects
         found = jaw_grasps(segmentation, item, GRID.resolution, PickPlaceParameters())
         return [
-            grasp.cost
+            grasp.rank
             for grasp in found
             if abs(grasp.pixel[1] - 109.5) < 4 and abs(math.cos(grasp.theta)) < 0.2
         ]
