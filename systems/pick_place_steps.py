@@ -34,6 +34,9 @@ value."""
 _STALLED = 0.1
 """The jaws have stalled when they close at less than this share of the commanded speed. Soft pads
 still yield more slowly than that while the force builds up."""
+_STILL, _LONGEST_CHECK = 0.002, 0.4
+"""The grip is checked once the jaws move more slowly than this, in m/s, or after this time, in s:
+an object that leans or lies askew yields for a while."""
 _FIXED = 20.0
 """If the closed jaws feel a lateral force above this at rest, in N, they grip something fixed."""
 _STUCK = 0.004
@@ -172,6 +175,8 @@ class PickPlaceSteps:
         """Begins the lift if a loose object is between the pads, else lets go and retreats."""
         state, time, hand, contact = moment.state, moment.time, moment.hand, moment.contact
         if time < self._motion.arrival(state) + self._settle:
+            return
+        if abs(hand[10] + hand[11]) > _STILL and time < state.start_time + _LONGEST_CHECK:
             return
         is_held = self._is_held(hand, contact)
         if is_held and math.hypot(*contact[:2]) > _FIXED:
