@@ -15,6 +15,7 @@ from systems.arm_kinematics import ArmBase, fingertips
 from systems.arm_limits import JOINTS, ArmLimits
 from systems.arm_postures import ArmPostures, HandStop
 from systems.arm_reach import hand_stops
+from systems.arm_stop import ArmStop
 from systems.arm_way import ArmWay, WayVector
 from systems.floating_hand_motion import TRIAL
 from systems.guarded_marks import guarded_marks
@@ -243,8 +244,11 @@ class ArmMotion(JawMotion):
             if not state.refused:
                 way.over, way.clear, way.sink = state.pick_joints, state.clear_z, state.pick_hover_z
         elif mode == Mode.LIFT and state.doubts_grip:
-            # Lift a little as a trial, to measure how the object's weight pulls on the hand.
-            way.line = self.postures.hand_pose(now[:JOINTS])
+            # Lift a little as a trial, to measure how the object's weight pulls on the hand. A hand
+            # that already rises must not come down again.
+            q, v, a = now.reshape(3, -1)
+            stop = ArmStop(q, v, a, self.postures.limits, self._inertia)
+            way.line = self.postures.hand_pose(stop.goal)
             way.line[2] = max(state.hold_z + TRIAL, float(way.line[2]))
             way.speeds, way.yaw_speed = limits.speed, limits.yaw_speed
         elif mode in (Mode.LIFT, Mode.CARRY):

@@ -26,8 +26,8 @@ _UNWEIGHED = (Mode.LIFT, Mode.CARRY)
 """The modes in which an object of unknown weight may be in the hand."""
 _LETS_GO = (Mode.RELEASE, Mode.RETREAT)
 _RISES = (Mode.LIFT, Mode.RETREAT)
-_AT_ONCE = (Mode.APPROACH, Mode.CHECK, Mode.CARRY)
-"""The modes in which the guard acts at once, because the hand is in the air, or at rest."""
+_AT_ONCE = (Mode.APPROACH, Mode.CHECK, Mode.LIFT, Mode.CARRY)
+"""The modes in which the guard acts at once, because the hand is in the air, at rest, or rises."""
 _AT_REST = (Mode.OBSERVE, Mode.DONE)
 
 
@@ -59,9 +59,9 @@ class ContactGuard:
     - In `RELEASE` and `RETREAT` the jaws may or may not still hold the object, so any f_z between
       the object's weight and zero counts as no contact.
 
-    The guard acts if the vertical or the lateral force exceeds the limit. In `APPROACH`, `CHECK`
-    and `CARRY`, where no impact is expected, it acts at once; in other modes, after 1/64 s. A
-    push from below does not count while the hand rises. Vertical forces do not count while the
+    The guard acts if the vertical or the lateral force exceeds the limit. In `APPROACH`, `CHECK`,
+    `LIFT` and `CARRY`, where no impact is expected, it acts at once; in other modes, after 1/64 s.
+    A push from below does not count while the hand rises. Vertical forces do not count while the
     hand presses an object down; then `press_force` is the limit.
 
     A peak is the largest mean over 1/64 s, as a wrist sensor would show it. In a shorter time the

@@ -329,6 +329,24 @@ def test_the_arm_descends_more_slowly_if_the_heights_are_uncertain(doubt: float)
     assert 0.9 * allowed < speeds.max() < 1.05 * allowed
 
 
+def test_a_trial_lift_never_brings_a_rising_hand_down():
+    motion = motion_of()
+    state = motion.view(motion.initial_state())
+    set_action(state, (0.5, 0.2, 0.4), (0.5, -0.2, 1.0))
+    assert motion.prepare(state)
+    time = 1.0
+    for mode in (Mode.APPROACH, Mode.DESCEND, Mode.CHECK):
+        motion.begin(state, mode, time)
+        time = motion.arrival(state)
+    motion.begin(state, Mode.LIFT, time)
+    time += 0.12
+    state.doubts_grip = 1
+    motion.begin(state, Mode.LIFT, time)
+    heights = fingertips(states(motion, state, time, motion.arrival(state))[:, :7])[:, 2]
+    assert heights[-1] > heights[0] + 0.005
+    assert np.diff(heights).min() > -1e-5
+
+
 def test_postures_from_which_the_joints_turn_little_are_preferred(monkeypatch: pytest.MonkeyPatch):
     motion, rng = motion_of(), np.random.default_rng(5)
     state = motion.view(motion.initial_state())
