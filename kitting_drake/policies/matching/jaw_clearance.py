@@ -220,15 +220,7 @@ def _grip(
     arm = (centres - middle) * resolution
     lever = np.abs((arm * along).sum(axis=1))
     aside = np.abs((arm * across).sum(axis=1))
-    cost = (
-        lever / 0.025
-        + (lever / 0.040) ** 2
-        + aside / 0.050
-        + 2.4 * (1 - contact)
-        + 2.0 * lean
-        + 4.0 * twist
-        + np.maximum(0.0, width - 0.035) / 0.015
-    )
+    cost = _costs(lever, aside, width, contact, lean, twist)
     fits &= contact > 0
     chosen = np.flatnonzero(fits)
     below = heights_below_palm(raised, centres[chosen], thetas[chosen], resolution, step=3.0)
@@ -238,6 +230,29 @@ def _grip(
         JawGrasp(centres[i], float(thetas[i]), float(cost[i]), bool(unsure[i]))
         for i in np.flatnonzero(fits)
     ]
+
+
+def _costs(
+    lever: Array, aside: Array, width: Array, contact: Array, lean: Array, twist: Array
+) -> Array:
+    """(n,) `JawGrasp.cost` of n grasps.
+
+    Args:
+        lever: (n,) distance from the object's centre along the pads, in metres.
+        aside: (n,) distance from the object's centre across the pads, in metres.
+        width: (n,) distance between the gripped faces, in metres.
+        contact: (n,) the first value that `_straightness` returns; `lean` and `twist` are the
+            second and the third.
+    """
+    return np.asarray(
+        lever / 0.025
+        + (lever / 0.040) ** 2
+        + aside / 0.050
+        + 2.4 * (1 - contact)
+        + 2.0 * lean
+        + 4.0 * twist
+        + np.maximum(0.0, width - 0.035) / 0.015
+    )
 
 
 def _straightness(
