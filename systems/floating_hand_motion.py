@@ -175,7 +175,10 @@ class HandMotion(JawMotion):
         return fast, min(fast, parameters.contact_speed), min(fast, parameters.touch_speed)
 
     def _legs(self, state: PlannerState) -> tuple[Leg, ...]:
-        speeds = self._leg_speeds(Mode(int(state.mode)))
+        mode = Mode(int(state.mode))
+        if mode not in (Mode.DESCEND, Mode.LOWER):
+            return ()
+        speeds = self._leg_speeds(mode)
         return tuple(
             Leg(way, speed, delay)
             for way, speed, delay in zip(

@@ -151,7 +151,9 @@ def braking_time(rate: NDArray[np.float64], limits: MotionLimits) -> float:
         rate: (4) velocities of x, y, z and yaw, in m/s and rad/s.
         limits: only the accelerations are used.
     """
-    vx, vy, vz, vyaw = map(float, rate)
+    vx, vy, vz, vyaw = rate.tolist()
+    if not (vx or vy or vz or vyaw):
+        return 0.0
     return 1.5 * max(
         math.hypot(vx, vy) / limits.acceleration,
         abs(vz) / limits.acceleration,
@@ -195,7 +197,9 @@ def motion_at(
             position[i] += rate * braking * (s - s**3 + s**4 / 2)
             velocity[i] += rate * (1 - s**2 * (3 - 2 * s))
             acceleration[i] -= rate * 6 * s * (1 - s) / braking
-    for part, delta, distance, limit, delay in _ways(start, goal, start_rate, limits, delays, legs):
+    for part, delta, distance, limit, delay in _ways(
+        start, goal, start_rate, braking, limits, delays, legs
+    ):
         if distance > 0:
             gone, rate, change = travel(distance, *limit, elapsed - delay)
             for i, way in zip(part, delta, strict=True):
@@ -214,25 +218,33 @@ def motion_duration(
     legs: Sequence[Leg] = (),
 ) -> float:
     """Duration of the motion that `motion_at` computes, in s."""
+    braking = braking_time(start_rate, limits)
     ends = [
         delay + travel_time(distance, *limit)
-        for _, _, distance, limit, delay in _ways(start, goal, start_rate, limits, delays, legs)
+        for _, _, distance, limit, delay in _ways(
+            start, goal, start_rate, braking, limits, delays, legs
+        )
         if distance > 0
     ]
-    return max(ends + [braking_time(start_rate, limits)])
+    return max([*ends, braking])
 
 
 def _ways(
     start: NDArray[np.float64],
     goal: NDArray[np.float64],
     start_rate: NDArray[np.float64],
+    braking: float,
     limits: MotionLimits,
     delays: NDArray[np.float64],
     legs: Sequence[Leg],
 ) -> Iterator[tuple[list[int], list[float], float, tuple[float, float], float]]:
     """Yields, for each of the `PARTS` or each leg: the indices of its axes, its displacement after
     braking, the norm of the displacement, its (speed, acceleration) limits, and its delay in s."""
-    ways = (goal - start - start_rate * braking_time(start_rate, limits) / 2).tolist()
+    rates = start_rate.tolist()
+    ways = [
+        end - begin - rate * braking / 2
+        for begin, end, rate in zip(start.tolist(), goal.tolist(), rates, strict=True)
+    ]
     for part, limit, delay in zip(PARTS, limits.of_parts(), delays.tolist(), strict=True):
         if legs and part == PARTS[1]:
             for leg in legs:

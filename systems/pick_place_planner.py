@@ -209,6 +209,10 @@ class PickPlacePlanner(LeafSystem):
                 name, functools.partial(Value, empty), weak_calc(calc), tickets
             )
 
+    def mode(self, context: Context) -> Mode:
+        """The present mode, in this system's context."""
+        return Mode(int(self._state(context).mode))
+
     def _state(self, context: Context) -> PlannerState:
         return self._motion.view(context.get_discrete_state(self._state_index).get_value())
 

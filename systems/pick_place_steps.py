@@ -53,7 +53,7 @@ _RISEN = 0.0005
 """The hand counts as lifted when it is this far, in m, above its height at the grip."""
 
 
-@dataclass(frozen=True)
+@dataclass(slots=True)
 class Moment:
     """The inputs of one step of the state machine."""
 

@@ -86,6 +86,21 @@ class PlacedObject:
 
         return cKDTree(self.p_BPoints)
 
+    @cached_property
+    def _last_add_s(self) -> dict[bytes, tuple[bytes, float]]:
+        """By goal pose: the last pose that `add_s` was computed for, and the result."""
+        return {}
+
+    def add_s(self, X_WGoal: RigidTransform, X_WB: RigidTransform) -> float:
+        """The ADD-S of a pose of the object, in metres; see `add_s`. The last result for each goal
+        pose is kept, because most objects have not moved since."""
+        goal, actual = (pose.GetAsMatrix34().tobytes() for pose in (X_WGoal, X_WB))
+        known = self._last_add_s.get(goal)
+        if known is None or known[0] != actual:
+            known = actual, _add_s(self.tree, self.p_BPoints, X_WGoal, X_WB)
+            self._last_add_s[goal] = known
+        return known[1]
+
 
 @dataclass(frozen=True)
 class Goal:
@@ -346,7 +361,7 @@ def _measure(
     measured = Placement(
         goal=goal_index,
         pose=pose_index,
-        add_s=_add_s(item.tree, item.p_BPoints, X_WGoal, X_WB),
+        add_s=item.add_s(X_WGoal, X_WB),
         position_error=float(np.linalg.norm(offset[:2])),
         angle_error=angle,
         height_error=float(offset[2]),

@@ -30,29 +30,37 @@ class BoundedBody:
     boxes: Sequence[Box]
 
 
+_NOWHERE = 1e6
+"""Every element of a pose's matrix before the first update; far from every pose."""
+_KEPT_AWAKE = 1 / 16
+"""An object that something nearby keeps awake is tested again after this time, in s."""
+_ROTATION_AND_POSITION = np.tile([[1, 0], [1, 0], [1, 0], [0, 1]], (3, 1)).astype(float)
+"""(12, 2): sums the elements of the rotation, and those of the position, of a pose's (3, 4)
+matrix."""
+
+
 class _Boxes:
     """The half sizes and poses of k boxes, as arrays."""
 
     def __init__(self, boxes: Sequence[Box]) -> None:
-        self.poses = np.array([box.X_BBox.GetAsMatrix34() for box in boxes])
+        poses = np.array([box.X_BBox.GetAsMatrix34() for box in boxes])
+        self.rotations, self.centres = poses[:, :, :3], poses[:, :, 3]
         self.halves = np.array([box.half_size for box in boxes], float)
 
     def posed(self, X: NDArray[np.float64]) -> tuple[NDArray, NDArray, NDArray]:
         """Rotations (k, 3, 3), centres (k, 3) and half sizes (k, 3) of the posed boxes.
 
         Args:
-            X: pose of the boxes' common frame, (3, 4), or of each box's own frame, (k, 3, 4).
+            X: (3, 4) pose of the boxes' common frame.
         """
-        rotations = X[..., :3] @ self.poses[:, :, :3]
-        centres = np.einsum("...ij,...j->...i", X[..., :3], self.poses[:, :, 3]) + X[..., 3]
-        return rotations, centres, self.halves
+        return X[:, :3] @ self.rotations, self.centres @ X[:, :3].T + X[:, 3], self.halves
 
     def enclosing(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Centre (3) and half size (3) of the box around all boxes, aligned with their common
         frame."""
-        reach = np.einsum("kij,kj->ki", np.abs(self.poses[:, :, :3]), self.halves)
-        lower = (self.poses[:, :, 3] - reach).min(axis=0)
-        upper = (self.poses[:, :, 3] + reach).max(axis=0)
+        reach = np.einsum("kij,kj->ki", np.abs(self.rotations), self.halves)
+        lower = (self.centres - reach).min(axis=0)
+        upper = (self.centres + reach).max(axis=0)
         return (lower + upper) / 2, (upper - lower) / 2
 
 
@@ -104,7 +112,8 @@ class RestDetector(LeafSystem):
     quaternion.
 
     State (discrete): for each object the pose that it stays near, the time that it has stayed
-    there (s), and whether it rests.
+    there (s), and whether it rests; the poses when distances were last tested, and how far bodies
+    may move before the next test.
     """
 
     def __init__(
@@ -141,19 +150,26 @@ class RestDetector(LeafSystem):
         # Centres and half sizes, (bodies, 3) each, of a box around each body, in the body's frame.
         self._centres = np.array([centre for centre, _ in wholes])
         self._halves = np.array([half_size for _, half_size in wholes])
-        self._position_tolerance = position_tolerance
+        # A point at the distance r from its body's origin moves by at most r times the Frobenius
+        # norm of the change of rotation, plus the displacement of the origin.
+        radii = np.linalg.norm(np.abs(self._centres) + self._halves, axis=1)
+        self._reaches = np.column_stack([radii, np.ones(len(radii))])
         # A rotation by the angle a differs from the identity by 2 sqrt(2) sin(a / 2) in the
         # Frobenius norm.
-        self._rotation_tolerance = 2 * np.sqrt(2) * np.sin(angle_tolerance / 2)
+        self._tolerances = np.square(
+            [2 * np.sqrt(2) * np.sin(angle_tolerance / 2), position_tolerance]
+        )
         self._time_to_sleep = time_to_sleep
         self._wake_distance = wake_distance
         self._period = period
         self._poses = self.DeclareAbstractInputPort("body_poses", Value([RigidTransform()]))
-        # Anchors are the poses near which objects must stay. Begin with infinity, so that the first
-        # update sets them all.
-        self._anchors = self.DeclareDiscreteState(np.full(12 * self._count, np.inf))
+        # The poses that the objects must stay near, then the poses of all bodies at the last test.
+        self._references = self.DeclareDiscreteState(
+            np.full(12 * (self._count + len(bodies)), _NOWHERE)
+        )
         self._still_for = self.DeclareDiscreteState(self._count)
         self._at_rest = self.DeclareDiscreteState(self._count)
+        self._margin = self.DeclareDiscreteState(1)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
         self.DeclareStateOutputPort("at_rest", self._at_rest)
 
@@ -164,56 +180,74 @@ class RestDetector(LeafSystem):
     def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         n = self._count
         poses = self._poses.Eval(context)
-        X = np.array([poses[body].GetAsMatrix34() for body in self._bodies])
-        anchors = discrete_state.get_mutable_value(self._anchors).reshape(n, 3, 4)
+        now = np.array([poses[body].GetAsMatrix34() for body in self._bodies]).reshape(-1, 12)
+        references = discrete_state.get_mutable_value(self._references).reshape(-1, 12)
         still_for = discrete_state.get_mutable_value(self._still_for)
-        moved = X[:n] - anchors
-        squares = moved * moved
-        stayed = (squares[:, :, 3].sum(axis=1) <= self._position_tolerance**2) & (
-            squares[:, :, :3].sum(axis=(1, 2)) <= self._rotation_tolerance**2
-        )
-        anchors[~stayed] = X[:n][~stayed]
-        still_for[:] = np.where(stayed, still_for + self._period, 0.0)
+        at_rest = discrete_state.get_mutable_value(self._at_rest)
+        changes = np.concatenate([now[:n], now]) - references
+        squares = changes * changes @ _ROTATION_AND_POSITION
+        stayed = (squares[:n] <= self._tolerances).all(axis=1)
+        still_for += self._period
+        if not stayed.all():
+            references[:n][~stayed] = now[:n][~stayed]
+            still_for[~stayed] = 0.0
         resting = stayed & (still_for >= self._time_to_sleep - self._period / 2)
-        self._wake(X, resting)
+        if resting.any():
+            margin = discrete_state.get_mutable_value(self._margin)
+            moved = 2 * (np.sqrt(squares[n:]) * self._reaches).sum(axis=1).max()
+            # The first condition is also true for NaN.
+            if not moved <= margin[0] or (resting != at_rest).any():
+                candidates = resting.copy()
+                margin[0] = self._wake(now.reshape(-1, 3, 4), resting)
+                references[n:] = now
+                woken = candidates & ~resting
+                still_for[woken] = np.minimum(still_for[woken], self._time_to_sleep - _KEPT_AWAKE)
+        at_rest[:] = resting
         # This form is also true for NaN.
-        resting |= ~(np.square(X[:n, :, 3]).sum(axis=1) < GONE**2)
-        discrete_state.get_mutable_value(self._at_rest)[:] = resting
+        if not np.abs(now[:n]).max(initial=0.0) < GONE / 2:
+            at_rest[~(np.linalg.norm(now[:n, 3::4], axis=1) < GONE)] = 1.0
         return EventStatus.Succeeded()
 
-    def _wake(self, X: NDArray[np.float64], resting: NDArray[np.bool_]) -> None:
+    def _wake(self, X: NDArray[np.float64], resting: NDArray[np.bool_]) -> float:
         """Sets `resting` to false for objects near a body that is not at rest.
 
         Args:
             X: (bodies, 3, 4) X_WB of each body.
             resting: (n,) whether each object rests; modified.
+
+        Returns:
+            How far two bodies may approach each other, in m, before another object can wake; 0 if
+            an object has woken.
         """
-        if not resting.any():
-            return
-        waking = np.append(~resting, np.ones(len(self._bodies) - self._count, bool))
+        n = self._count
+        waking = np.ones(len(self._bodies), bool)
+        waking[:n] = ~resting
         # Cheap tests come first: boxes aligned with the world, then boxes around bodies, then boxes
         # around their pieces. Most of the time the first suffices.
         rotations = X[:, :, :3]
-        centres = np.einsum("bij,bj->bi", rotations, self._centres) + X[:, :, 3]
+        centres = (rotations @ self._centres[:, :, None])[:, :, 0] + X[:, :, 3]
+        reach = (np.abs(rotations) @ self._halves[:, :, None])[:, :, 0]
+        apart = np.abs(centres[:n, None] - centres) - reach[:n, None] - reach
+        margins = apart.max(axis=2) - self._wake_distance
         boxes = rotations, centres, self._halves
-        reach = np.einsum("bij,bj->bi", np.abs(rotations), self._halves)
-        apart = np.abs(centres[: self._count, None] - centres) - reach[: self._count, None] - reach
-        close = (apart < self._wake_distance).all(axis=2)
-        if not (close & resting[:, None] & waking).any():
-            return
+        wakes = False
         # An awake object wakes its neighbours, which wake theirs.
-        while waking.any():
+        while True:
             i, j = np.flatnonzero(resting), np.flatnonzero(waking)
-            near = close[np.ix_(i, j)]
+            near = margins[np.ix_(i, j)]
+            if (near < 0).any():
+                gaps = _gaps(*([part[k] for part in boxes] for k in (i, j)))
+                near = np.maximum(near, gaps - self._wake_distance)
             waking[:] = False
-            if not near.any():
-                break
-            near &= _gaps(*([part[k] for part in boxes] for k in (i, j))) < self._wake_distance
-            for a, b in np.argwhere(near):
-                if resting[i[a]] and self._are_near(X, i[a], j[b]):
-                    resting[i[a]], waking[i[a]] = False, True
+            for a, b in np.argwhere(near < 0):
+                if resting[i[a]]:
+                    near[a, b] = self._gap(X, i[a], j[b]) - self._wake_distance
+                    if near[a, b] < 0:
+                        resting[i[a]], waking[i[a]] = False, True
+            if not waking.any():
+                return 0.0 if wakes else float(near.min(initial=np.inf))
+            wakes = True
 
-    def _are_near(self, X: NDArray[np.float64], i: int, j: int) -> bool:
-        """Whether pieces of two bodies are within `wake_distance` of each other."""
-        gaps = _gaps(self._pieces[i].posed(X[i]), self._pieces[j].posed(X[j]))
-        return bool(gaps.min() < self._wake_distance)
+    def _gap(self, X: NDArray[np.float64], i: int, j: int) -> float:
+        """A lower bound of the distance between the pieces of two bodies, in m."""
+        return float(_gaps(self._pieces[i].posed(X[i]), self._pieces[j].posed(X[j])).min())

@@ -154,7 +154,7 @@ class KittingStation(Diagram):
             builder.ExportOutput(projector.GetOutputPort("heights"), "observation_heights")
         self.has_cameras = projector is not None
         """Whether the port `observation` exists."""
-        planner = add_control(
+        self._planner = add_control(
             builder,
             scenario,
             self.scene,
@@ -168,7 +168,7 @@ class KittingStation(Diagram):
         self._feeder = self._add_feeder(builder)
         for system in (self._monitor, self._feeder):
             if system is not None:
-                builder.Connect(planner.GetOutputPort("mode"), system.GetInputPort("mode"))
+                builder.Connect(self._planner.GetOutputPort("mode"), system.GetInputPort("mode"))
         for name in ("body_poses", "contact_results"):
             builder.ExportOutput(self.plant.GetOutputPort(name), name)
         builder.ExportOutput(self.scene_graph.get_query_output_port(), "query_object")
@@ -243,7 +243,7 @@ class KittingStation(Diagram):
 
     def mode(self, root_context: Context) -> Mode:
         """The port `mode`: the planner's present mode."""
-        return Mode(int(self._eval(root_context, "mode")[0]))
+        return self._planner.mode(self._planner.GetMyContextFromRoot(root_context))
 
     def asks(self, root_context: Context) -> bool:
         """The port `asks`: whether the planner will read the action at its next update."""

@@ -110,7 +110,7 @@ def test_a_mover_nearby_keeps_an_object_awake():
     table.hand_over(RIGHT, gap=BESIDE)
     assert table.at_rest_after(1.0) == [True, False]
     table.hand_over(RIGHT, gap=0.007)
-    assert table.at_rest_after(1 / 64) == [True, True]
+    assert table.at_rest_after(1 / 16) == [True, True]
 
 
 def test_an_object_wakes_at_the_next_update():
@@ -118,6 +118,19 @@ def test_an_object_wakes_at_the_next_update():
     table.at_rest_after(1.0)
     table.hand_over(LEFT, gap=BESIDE)
     assert table.at_rest_after(1 / 64) == [False, True]
+
+
+@pytest.mark.parametrize("step", [0.0004, 0.0011, 0.017])
+def test_a_slow_hand_wakes_an_object_in_time(step: float):
+    """Distances are not tested at every update, but never too late."""
+    table = Table()
+    gap = 0.08
+    table.hand_over(LEFT, gap)
+    assert table.at_rest_after(1.0) == [True, True]
+    while gap > 0:
+        gap -= step
+        table.hand_over(LEFT, gap)
+        assert table.at_rest_after(1 / 64) == [gap > 0.006, True]
 
 
 @pytest.mark.parametrize("metres", [20.0, np.nan])
