@@ -119,12 +119,15 @@ class FreeBodies:
         if abs(math.remainder(root_context.get_time(), step)) >= 1e-6 * step:
             return
         context = self._plant.GetMyMutableContextFromRoot(root_context)
-        correct_drift(self._plant, context, self._bodies)
+        awake = [body for body in self._bodies if not body.is_locked(context)]
+        if not awake:
+            return
+        correct_drift(self._plant, context, awake)
         if self._arm_path is not None:
             # Do not evaluate the port `robot_state` here: that would keep the Diagram alive
             # forever.
             state = robot_state(self._plant, context)
-            self._arm_path.correct(self._plant, context, state, self._bodies)
+            self._arm_path.correct(self._plant, context, state, awake)
 
     def _geometry(self, bodies: Iterable[RigidBody]) -> GeometrySet:
         geometry = GeometrySet()

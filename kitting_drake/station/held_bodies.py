@@ -63,14 +63,14 @@ def correct_drift(plant: MultibodyPlant, context: Context, bodies: Sequence[Rigi
     Args:
         plant: the plant, which must be discrete.
         context: the plant's context; modified.
-        bodies: free bodies. Those that are locked or hardly rotate are not changed.
+        bodies: free bodies that are not locked. Those that hardly rotate are not changed.
     """
     velocities = plant.GetVelocities(context)
     speeds = np.abs(velocities).tolist()
     for body in bodies:
         start = body.floating_velocities_start_in_v()
         rate = velocities[start : start + 3]
-        if not max(speeds[start : start + 3]) > _LEAST_ROTATION or body.is_locked(context):
+        if not max(speeds[start : start + 3]) > _LEAST_ROTATION:
             continue
         p_BoBcm_B = body.CalcCenterOfMassInBodyFrame(context)
         X_WB: RigidTransform = body.EvalPoseInWorld(context)
@@ -106,13 +106,11 @@ class ArmPath:
             plant: the plant, which must be discrete.
             context: the plant's context; modified.
             state: (18) positions of the arm's joints and fingers, then their velocities.
-            bodies: free bodies. Those that are locked or do not move with the hand are not changed.
+            bodies: free bodies that are not locked. Those that do not move with the hand are not
+                changed.
         """
         q, v = state[:9], state[9:]
         if not np.abs(v[:7]).max() > _LEAST_JOINT_RATE:
-            return
-        free = [body for body in bodies if not body.is_locked(context)]
-        if not free:
             return
         arm, scratch, h = self._arm, self._scratch, self._step
         arm.SetPositionsAndVelocities(scratch, np.concatenate([q - h * v, v]))
@@ -122,7 +120,7 @@ class ArmPath:
         X_moved = self._gripper.CalcPoseInWorld(scratch) @ X_WG0.inverse()
         R_moved = X_moved.rotation() @ _rotation(-h * V_WG.rotational())
         velocities = plant.GetVelocities(context)
-        for body in free:
+        for body in bodies:
             start = body.floating_velocities_start_in_v()
             V_WB = SpatialVelocity(velocities[start : start + 6])
             X_WB: RigidTransform = body.EvalPoseInWorld(context)
