@@ -100,8 +100,8 @@ class Inventory:
         """The recesses that seem free, except those into which an object was placed.
 
         A flat tool in its recess looks like the recess's floor, and so does any tool if there is
-        noise. But without noise, if an object is loose, what seems free is free; and so is a recess
-        into which a loose object fits.
+        noise. But without noise, if an object is loose, what seems free is free. A recess into
+        which a loose object fits is free, and so is one from which the object was taken out.
         """
         seen = self.segmentation
         if seen.noise <= CLEAN and seen.objects:
@@ -109,9 +109,11 @@ class Inventory:
         wanted = {id(seen.recesses[pair.recess]) for pair in self.matches}
         moved = ([it for it in moves if it.outcome != "pressed"] for moves in self._moves)
         last = [moves[-1] for moves in moved if moves]
-        placed = [it.action for it in last if it.outcome == "placed" and not it.action.aside]
-        filled = {id(self._recess_at(action.place)) for action in placed} - wanted
-        return tuple(item for item in seen.free_recesses if id(item) not in filled)
+        done = [it.action for it in last if it.outcome == "placed"]
+        filled = {id(self._recess_at(it.place)) for it in done if not it.aside} - wanted
+        emptied = {id(self._recess_at(it.pick)) for it in done if it.aside}
+        free = {id(item) for item in seen.free_recesses} | wanted | emptied
+        return tuple(item for item in seen.recesses if id(item) in free - filled)
 
     @property
     def strangers(self) -> tuple[Region, ...]:
@@ -299,12 +301,11 @@ class Inventory:
         others = (item for item in self.segmentation.objects if item is not region)
         return not any((around & item.mask).any() for item in others)
 
-    def _recess_at(self, place: PlanarPose) -> Region | None:
-        """Returns the recess into which an action placed its object; None if it placed it
-        elsewhere."""
-        pixel = np.array(self.observation.grid.to_pixel((place.x, place.y)))
+    def _recess_at(self, pose: PlanarPose) -> Region | None:
+        """Returns the recess at a gripper's pose; None if there is none."""
+        pixel = np.array(self.observation.grid.to_pixel((pose.x, pose.y)))
         region = nearest_region(self.segmentation.recesses, pixel)
-        return region if region is not None and self._is_there(place, region) else None
+        return region if region is not None and self._is_there(pose, region) else None
 
     @property
     def _has_filled(self) -> bool:

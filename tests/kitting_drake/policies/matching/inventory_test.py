@@ -278,3 +278,17 @@ def test_with_noise_a_recess_that_was_filled_is_not_worth_a_try():
     assert len(found.segmentation.free_recesses) == 2
     assert not found.free_recesses and not found.worth_a_try
     assert found.why_stop == "done"
+
+
+def test_a_recess_whose_object_was_taken_out_is_free_even_if_its_floor_looks_rough():
+    on_edge = np.zeros(GRID.shape, bool)
+    on_edge[60:64, 180:205] = True
+    seen = noisy(scene((on_edge, 0.02)))
+    rough = noisy(seen, deviation=0.003).image[3]
+    seen.image[3, hammer(30, 35)] = rough[hammer(30, 35)]
+    assert len(Inventory.of(seen).free_recesses) == 1
+    there, here = (PlanarPose(*map(float, GRID.to_world(p))) for p in ((42.0, 60.0), (62.0, 192.0)))
+    taken_out = Attempt(PickPlaceAction(there, here, aside=True), "placed")
+    found = Inventory.of(dataclasses.replace(seen, history=(taken_out,)))
+    assert len(found.free_recesses) == 2
+    assert found.why_stop == "gave up"
