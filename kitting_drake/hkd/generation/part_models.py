@@ -11,12 +11,8 @@ from manifold3d import Manifold, OpType
 from kitting_drake.common.cached_folder import cached_folder
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import cache_directory
-from kitting_drake.hkd.families.parts import (
-    PART_KINDS,
-    PartDesign,
-    PartError,
-    design_part,
-)
+from kitting_drake.hkd.families.parts import PartDesign, PartError
+from kitting_drake.hkd.generation.part_kinds import PART_KINDS, design_part
 from kitting_drake.hkd.tools import meshes
 from kitting_drake.hkd.tools.mass import mass_properties
 from kitting_drake.hkd.tools.sdf import tool_sdf

@@ -10,11 +10,12 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
 
 from kitting_drake.common.errors import UserError
-from kitting_drake.hkd.families.parts import LONGEST_MM, PART_KINDS, design_part
+from kitting_drake.hkd.generation.part_kinds import PART_KINDS, design_part
 from kitting_drake.hkd.generation.part_models import load_named, sized_part
 from kitting_drake.hkd.grasps.grip import find_grip
 from kitting_drake.hkd.kits.layout import layout_kit
 from kitting_drake.hkd.kits.parameters import KitParameters
+from kitting_drake.hkd.tools.tool import LONGEST_MM
 from systems.hand_geometry import MAX_OPENING, PAD_LENGTH
 
 
