@@ -84,8 +84,9 @@ class ClutterExpert:
         choices = [index for index in items if not self._covered[index]] or list(items)
         found = []
         for index in choices:
+            top = float(self._points[index][:, 2].max())
             for rank, hold in enumerate(self._holds(index, None)):
-                found.append((hold.obstruction, -hold.top, rank, index, hold))
+                found.append((hold.obstruction, -top, rank, index, hold))
         for _, _, _, index, hold in sorted(found, key=lambda row: row[:4]):
             place = self._table.aside(index, hold, self._poses, self._points)
             if place is not None:
