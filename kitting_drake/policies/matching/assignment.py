@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from kitting_drake.policies.matching.half_turn import better_half_turn
 from kitting_drake.policies.matching.regions.segmentation import Region, Segmentation
 from kitting_drake.policies.matching.registration import (
     Registration,
@@ -71,11 +72,12 @@ def match(segmentation: Segmentation, resolution: float) -> list[Pair]:
     # Clip the costs, so that one hopeless pair does not outweigh all others.
     rows, cols = linear_sum_assignment(np.minimum(costs, _WORST_COST))
     index = {id(item): index for index, item in enumerate(segmentation.recesses)}
-    pairs = [
-        Pair(i, index[id(regions[j])], fits[i, j], float(costs[i, j]))
-        for i, j in zip(rows.tolist(), cols.tolist(), strict=True)
-        if costs[i, j] < _WORST_COST
-    ]
+    pairs = []
+    for i, j in zip(rows.tolist(), cols.tolist(), strict=True):
+        if costs[i, j] < _WORST_COST:
+            known = segmentation.depth, objects[i], regions[j], (outlines[i], recesses[j])
+            fit = better_half_turn(*known, fits[i, j])
+            pairs.append(Pair(i, index[id(regions[j])], fit, float(costs[i, j])))
     return sorted(pairs, key=lambda pair: pair.mismatch)
 
 

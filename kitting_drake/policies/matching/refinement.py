@@ -19,6 +19,7 @@ from scipy import ndimage
 
 from kitting_drake.policies.data.images import rotation_matrix
 from kitting_drake.policies.matching.assignment import Pair
+from kitting_drake.policies.matching.half_turn import evidence
 from kitting_drake.policies.matching.jaw_clearance import JawGrasp, jaw_grasps, untried
 from kitting_drake.policies.matching.regions.segmentation import Region, Segmentation
 from kitting_drake.policies.matching.registration import (
@@ -27,7 +28,6 @@ from kitting_drake.policies.matching.registration import (
     coarse_cost,
     is_covered,
     mismatch,
-    preference,
     register,
     trace_outline,
 )
@@ -38,9 +38,9 @@ Array = NDArray[np.float64]
 
 _WORST_COST = 0.0016
 """A fit is accepted if the mean difference of the outlines is at most this, in metres."""
-_HALF_TURN_GAIN = 0.00005
-"""Another fit replaces the fit at the predicted rotation only if it is better by more than this, in
-metres (see `preference`)."""
+_HALF_TURN_GAIN = 0.0005
+"""Another fit replaces the fit at the predicted rotation only if its `evidence` is more than
+this."""
 _RIVAL_GAIN = 0.85
 """Another recess is chosen if its mismatch is less than this share of the predicted recess's
 mismatch."""
@@ -121,17 +121,16 @@ def refine_place(
         turned = abs(wrap_to_pi(found.rotation - angle))
         return found if away <= _LARGEST_SHIFT and turned <= _LARGEST_ROTATION else None
 
-    best, reverse = fit(rotation, goal), fit(rotation + math.pi, target.middle)
-    if reverse is not None and (
-        best is None or preference(outline, target, reverse, best) > _HALF_TURN_GAIN
-    ):
-        best = reverse
+    best, rivals = fit(rotation, goal), [fit(rotation + math.pi, target.middle)]
     for pair in pairs:
-        same = segmentation.objects[pair.item] is taken and (
+        if segmentation.objects[pair.item] is taken and (
             segmentation.recesses[pair.recess] is recess
-        )
-        if same and (best is None or preference(outline, target, pair.fit, best) > _HALF_TURN_GAIN):
-            best = pair.fit
+        ):
+            rivals.append(pair.fit)
+    known = segmentation.depth, taken, recess, (outline, target)
+    for rival in rivals:
+        if rival is not None and (best is None or evidence(*known, rival, best) > _HALF_TURN_GAIN):
+            best = rival
     if best is None or best.cost > _WORST_COST:
         return None
     others = [other for other in unfilled if other is not recess]
