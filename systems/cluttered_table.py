@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,7 @@ from systems.hand_geometry import (
     PALM_HEIGHT,
     PALM_SIZE,
 )
+from systems.jaw_motion import ROOM
 from systems.ledge import Ledge, moved_gripper
 from systems.motion_heights import motion_heights
 from systems.pick_place_parameters import PickPlaceParameters
@@ -56,7 +57,7 @@ _STEEPEST = math.radians(25.0)
 """The jaws cannot hold faces that are tilted by more than this, in radians, from the vertical."""
 _SLENDER = 0.020
 """Height of a finger's slender tip, in metres."""
-_PALM_ROOM = PALM_HEIGHT - 0.003
+_PALM_ROOM = PALM_HEIGHT - 0.002
 """Height of the palm above the fingertips, less a margin, in metres."""
 _MARGIN = 0.001
 """Least clearance between a finger and other objects, in metres."""
@@ -80,6 +81,10 @@ class HeldFromAbove:
     """World z of the whole object's lowest point, in metres."""
     obstruction: int
     """Number of surface points of other things that are in the way of the open hand."""
+    below_palm: float = -math.inf
+    """World z of the highest surface point below the palm, in metres."""
+    width: float = math.inf
+    """How wide the jaws must open, in metres; infinite if they may open fully."""
 
     def heights(self, highest: float, rim: float) -> SurfaceHeights:
         """The surface heights that the planner needs for this grasp.
@@ -97,6 +102,8 @@ class HeldFromAbove:
             near_pick=highest,
             near_place=highest,
             highest=highest,
+            below_palm=self.below_palm,
+            width=self.width,
         )
 
 
@@ -223,12 +230,21 @@ class ClutteredTable:
             return None
         heights = own[between, 2]
         top, bottom = float(heights.max()), float(heights.min())
-        surfaces = SurfaceHeights(pick_top=top, support=bottom)
-        tip = motion_heights(surfaces, self.planner).grasp
+        below_palm = _highest_below_palm(others, gripper)
+        surfaces = SurfaceHeights(pick_top=top, support=bottom, below_palm=below_palm)
+        tip = motion_heights(surfaces, self.planner).grasp + _MARGIN
         half = self.planner.open_width / 2
-        count = in_the_way(others, gripper, tip + _MARGIN, (grasp.width / 2, half))
+        count = in_the_way(others, gripper, tip, (grasp.width / 2, half))
         lowest = float(own[:, 2].min())
-        return HeldFromAbove(grasp, gripper, top, bottom, lowest, count)
+        hold = HeldFromAbove(grasp, gripper, top, bottom, lowest, count, below_palm)
+        if not count:
+            return hold
+        # Open the jaws only as far as the object needs, if fewer things are in the way then.
+        beside = (np.abs(along) < FINGER_LENGTH / 2 + _MARGIN) & (own[:, 2] > tip)
+        width = 2 * float(np.abs(across[beside]).max(initial=grasp.width / 2))
+        halves = (grasp.width / 2, min(width / 2 + ROOM, half))
+        fewer = in_the_way(others, gripper, tip, halves)
+        return replace(hold, obstruction=fewer, width=width) if fewer < count else hold
 
     def aside(
         self,
@@ -318,6 +334,14 @@ def in_the_way(points: Points, gripper: PlanarPose, tip: float, halves: tuple[fl
     in_fingers &= across < opened + reach
     in_palm = (along < PALM_SIZE[0] / 2) & (across < PALM_SIZE[1] / 2) & (z > tip + _PALM_ROOM)
     return int((in_fingers | in_palm).sum())
+
+
+def _highest_below_palm(points: Points, gripper: PlanarPose) -> float:
+    """World z of the highest of points (m, 3) below the palm, in metres; minus infinity if there is
+    none."""
+    along, across = _in_hand(points, gripper)
+    below = (np.abs(along) < PALM_SIZE[0] / 2) & (np.abs(across) < PALM_SIZE[1] / 2)
+    return float(points[below, 2].max(initial=-math.inf))
 
 
 def _in_hand(points: Points, gripper: PlanarPose) -> tuple[Points, Points]:

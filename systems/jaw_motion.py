@@ -4,7 +4,7 @@ from systems.hand_motion import ramp
 from systems.pick_place_parameters import Mode, PickPlaceParameters
 from systems.planner_state import PlannerState
 
-_ROOM = 0.005
+ROOM = 0.005
 """Distance of each pad from an object of known width before the jaws close, in m."""
 
 
@@ -25,7 +25,7 @@ class JawMotion:
 
     def wide(self, state: PlannerState) -> float:
         """The opening of the jaws before a grasp: the object's width plus some clearance, in m."""
-        return min(self._parameters.open_width, state.width + 2 * _ROOM)
+        return min(self._parameters.open_width, state.width + 2 * ROOM)
 
     def begin_jaws(
         self, state: PlannerState, mode: Mode, time: float, opening: float | None

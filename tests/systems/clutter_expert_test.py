@@ -9,7 +9,10 @@ from systems.clutter_expert import ClutterExpert
 from systems.cluttered_table import ClutteredTable, in_the_way
 from systems.free_area import find_free_pose
 from systems.grasp import Grasp
+from systems.hand_geometry import PALM_HEIGHT
 from systems.ledge import Ledge
+from systems.motion_heights import motion_heights
+from systems.pick_place_parameters import PickPlaceParameters
 from systems.placement import PlacedObject
 from systems.signals import PickPlaceAction, PlanarPose
 
@@ -96,16 +99,27 @@ def test_a_tilted_tool_is_laid_aside_by_its_best_grasp():
 
 def test_a_tool_between_others_is_gripped_where_it_is_free():
     # The other tool leaves no room for the fingers at the first two grasps.
-    clutter = expert(pose(0.5, 0.2), pose(0.6, 0.155, math.pi))
+    clutter = expert(pose(0.5, 0.2), pose(0.6, 0.165, math.pi))
     assert to_goal(clutter) is None
     action = clutter.aside([0])
     assert action is not None
     assert action.pick.x == pytest.approx(0.5 - 0.075, abs=0.03)
 
 
-def test_a_tool_beside_the_tall_kit_is_laid_where_the_hand_has_room():
+def test_the_jaws_open_less_beside_another_tool():
+    # The other tool is 25 mm away. Fully open, each jaw needs 45 mm.
+    action = to_goal(expert(pose(0.5, 0.2), pose(0.6, 0.155, math.pi)))
+    assert action is not None and action.heights is not None
+    assert action.heights.width == pytest.approx(0.02, abs=0.001)
+
+
+def test_a_tool_beside_the_tall_kit_is_gripped_higher():
     # The palm would hit the kit, 8 cm away.
-    start = pose(0.5, -0.08)
+    action = to_goal(expert(pose(0.5, -0.08)))
+    assert action is not None and action.heights is not None
+    assert motion_heights(action.heights, PickPlaceParameters()).grasp > 0.05 - PALM_HEIGHT
+    # Nearer to the kit the fingers have no room either, so the tool is laid elsewhere.
+    start = pose(0.5, -0.145)
     clutter = expert(start)
     assert to_goal(clutter) is None
     action = clutter.aside([0])
