@@ -15,8 +15,8 @@ from kitting_drake.policies.matching.registration import (
     coarse_cost,
     is_covered,
     mismatch,
+    outline_of,
     register,
-    trace_outline,
 )
 
 _WORST_COST = 0.0019
@@ -60,8 +60,8 @@ def match(segmentation: Segmentation, resolution: float) -> list[Pair]:
     objects, regions = segmentation.objects, segmentation.unfilled_recesses
     if not objects or not regions:
         return []
-    outlines = [trace_outline(item.mask, resolution, close=True) for item in objects]
-    recesses = [trace_outline(item.mask, resolution) for item in regions]
+    outlines = [outline_of(item, resolution, close=True) for item in objects]
+    recesses = [outline_of(item, resolution) for item in regions]
     coarse = np.array([[coarse_cost(o, c) for c in recesses] for o in outlines])
     fits: dict[tuple[int, int], Registration] = {}
     costs = np.full(coarse.shape, 10 * _WORST_COST)
@@ -101,7 +101,7 @@ def reversed_objects(
     filled = {pair.recess for pair in pairs}
     flat = {id(item) for item in segmentation.free_recesses}
     free = [j for j, item in enumerate(regions) if id(item) in flat]
-    traced = {j: trace_outline(regions[j].mask, resolution) for j in free}
+    traced = {j: outline_of(regions[j], resolution) for j in free}
     found = []
     for i, item in enumerate(objects):
         pair = known.get(i)
@@ -110,13 +110,13 @@ def reversed_objects(
         if own < _GOOD or not choices:
             continue
         mirrored = Region(item.mask[:, ::-1], item.height)
-        outline = trace_outline(mirrored.mask, resolution, close=True)
+        outline = outline_of(mirrored, resolution, close=True)
         coarse = {j: coarse_cost(outline, traced[j]) for j in choices}
         j = min(choices, key=lambda choice: coarse[choice])
         fit = register(outline, traced[j])
         better = mismatch(fit, mirrored, regions[j]) < _CLEARLY_BETTER * own
         if better and is_covered(outline, traced[j], fit):
-            seen = trace_outline(item.mask, resolution, close=True)
+            seen = outline_of(item, resolution, close=True)
             if not is_covered(outline, seen, register(outline, seen), _SYMMETRIC):
                 found.append(i)
     return tuple(found)

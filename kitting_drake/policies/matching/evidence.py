@@ -12,7 +12,7 @@ from scipy import ndimage
 from kitting_drake.policies.data.images import moved_pixels, rotation_matrix
 from kitting_drake.policies.matching.refinement import nearest_region
 from kitting_drake.policies.matching.regions.segmentation import Region, Segmentation
-from kitting_drake.policies.matching.registration import Registration, fit_quality, trace_outline
+from kitting_drake.policies.matching.registration import Registration, fit_quality, outline_of
 
 Array = NDArray[np.float64]
 
@@ -118,8 +118,8 @@ def _fit_facts(
     recess = segmentation.recesses[int(np.argmax(overlaps))]
     resolution = segmentation.visibility.resolution
     quality = fit_quality(
-        trace_outline(region.mask, resolution, close=True),
-        trace_outline(recess.mask, resolution),
+        outline_of(region, resolution, close=True),
+        outline_of(recess, resolution),
         Registration(rotation, place - rotation_matrix(rotation) @ pick, 0.0),
     )
     return {

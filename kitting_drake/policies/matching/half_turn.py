@@ -18,12 +18,15 @@ from kitting_drake.policies.matching.regions.segmentation import Region
 from kitting_drake.policies.matching.registration import (
     Outline,
     Registration,
+    half_turn_ratio,
     preference,
     register,
 )
 
 _PER_METRE = 10.0
 """A `preference` of one metre counts as much as this share of the recess's depth."""
+_UNLIKE = 1.5
+"""The two ends of an object are clearly different if its `half_turn_ratio` is above this."""
 _LARGEST = 0.001
 """The largest `preference` that counts, in metres."""
 
@@ -66,6 +69,8 @@ def better_half_turn(
     The arguments are those of `evidence`.
     """
     outline, target = outlines
+    if half_turn_ratio(outline, target, fit.rotation) > _UNLIKE:
+        return fit
     angle = fit.rotation + math.pi
     start = angle, target.middle - rotation_matrix(angle) @ outline.middle
     other = register(outline, target, starts=(start,))

@@ -28,8 +28,8 @@ from kitting_drake.policies.matching.registration import (
     coarse_cost,
     is_covered,
     mismatch,
+    outline_of,
     register,
-    trace_outline,
 )
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import wrap_to_pi
@@ -104,13 +104,13 @@ def refine_place(
     taken = nearest_region(segmentation.objects, pick)
     if taken is None:
         return None
-    outline = trace_outline(taken.mask, resolution, close=True)
+    outline = outline_of(taken, resolution, close=True)
     goal = place + rotation_matrix(rotation) @ (outline.middle - pick)
     unfilled = segmentation.unfilled_recesses
     recess = nearest_region(unfilled, goal)
     if recess is None:
         return None
-    target = trace_outline(recess.mask, resolution)
+    target = outline_of(recess, resolution)
 
     def fit(angle: float, middle: Array) -> Registration | None:
         """Returns the fit that starts at rotation `angle` with the object's centre at `middle`;
@@ -169,7 +169,7 @@ def _better_elsewhere(
     best, least = None, _RIVAL_GAIN * mismatch(fit, taken, recess)
     enough = _PROMISING * coarse_cost(outline, target)
     for other in others:
-        rival = trace_outline(other.mask, resolution)
+        rival = outline_of(other, resolution)
         if coarse_cost(outline, rival) > enough:
             continue
         found = register(outline, rival)

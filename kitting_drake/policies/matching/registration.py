@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,6 +75,11 @@ class Outline:
     values: Array
     """(p,): the signed distances at `points`."""
 
+    @cached_property
+    def compared(self) -> list[tuple[Outline, tuple[Array, Array]]]:
+        """The outlines with which this one was compared, and the results (see `_coarse`)."""
+        return []
+
     def sample(self, field: NDArray[np.float32], positions: Array, outside: float) -> Array:
         """Returns the values (n,) of `distance` or of a `gradient` at positions (n, 2) in pixels of
         o_t. Off the grid the value is `outside`."""
@@ -99,6 +105,15 @@ class Registration:
     def moved(self, pixel: Array) -> Array:
         """Returns the new position of a point (row, col) of the object."""
         return rotation_matrix(self.rotation) @ pixel + self.shift
+
+
+def outline_of(region: Region, resolution: float, *, close: bool = False) -> Outline:
+    """Returns the outline of a region (see `trace_outline`), which is computed only once."""
+    key = "outline", resolution, close
+    if key not in region.known:
+        region.known[key] = trace_outline(region.mask, resolution, close=close)
+    outline: Outline = region.known[key]
+    return outline
 
 
 def trace_outline(mask: Mask, resolution: float, *, close: bool = False) -> Outline:
@@ -176,6 +191,16 @@ def coarse_cost(outline: Outline, recess: Outline) -> float:
     """Returns a quick estimate of the cost of the best fit that `register` would find, in
     metres."""
     return float(_coarse(outline, recess)[0].min())
+
+
+def half_turn_ratio(outline: Outline, recess: Outline, rotation: float) -> float:
+    """Returns the `coarse_cost` of the rotation that differs by half a turn, as a multiple of that
+    of a rotation (in radians)."""
+    costs, angles = _coarse(outline, recess)
+    here, turned = (
+        costs[np.cos(angles - angle).argmax()] for angle in (rotation, rotation + math.pi)
+    )
+    return float(turned / max(here, 1e-9))
 
 
 def preference(
@@ -305,7 +330,16 @@ def mismatch(fit: Registration, item: Region, recess: Region) -> float:
 
 def _coarse(outline: Outline, recess: Outline) -> tuple[Array, Array]:
     """Returns the costs of evenly spaced rotations about the centroids, in metres, and these
-    rotations in radians."""
+    rotations in radians. They are computed once for each pair of outlines."""
+    for other, found in outline.compared:
+        if other is recess:
+            return found
+    costs = _compare_coarsely(outline, recess)
+    outline.compared.append((recess, costs))
+    return costs
+
+
+def _compare_coarsely(outline: Outline, recess: Outline) -> tuple[Array, Array]:
     step = max(1, len(outline.points) // _COARSE_POINTS)
     offsets = outline.points[::step] - outline.middle
     angles = np.arange(_ROTATIONS) * math.tau / _ROTATIONS

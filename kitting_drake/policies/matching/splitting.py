@@ -22,6 +22,7 @@ from kitting_drake.policies.matching.registration import (
     Outline,
     Registration,
     closed,
+    outline_of,
     register,
     residuals,
     trace_outline,
@@ -177,7 +178,7 @@ def _find(
 ) -> _Found | None:
     """Fits a recess's outline within a region, and returns the object at the best fit; None if
     the outline fits nowhere."""
-    template = trace_outline(recess.mask, resolution)
+    template = outline_of(recess, resolution)
     best: _Found | None = None
     for start in _starts(recess.mask, region, template, resolution):
         fit = register(template, around, starts=(start,), within=True)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,10 +75,21 @@ class Region:
     """The object's height above the table, or the recess's depth below the fixture's top, in
     metres: the 90th percentile over the region."""
 
-    @property
+    @cached_property
     def pixels(self) -> NDArray[np.intp]:
         """(n, 2): row and column of each pixel of the region."""
         return np.argwhere(self.mask)
+
+    @cached_property
+    def box(self) -> tuple[slice, slice]:
+        """The rows and columns of the region's bounding box."""
+        low, high = self.pixels.min(axis=0), self.pixels.max(axis=0) + 1
+        return slice(low[0], high[0]), slice(low[1], high[1])
+
+    @cached_property
+    def known(self) -> dict[Any, Any]:
+        """Results for this region that are computed once (see `outline_of`)."""
+        return {}
 
 
 @dataclass(frozen=True)
@@ -108,7 +120,7 @@ class Segmentation:
         """Whether o_t shows a kit: a fixture with recesses or protruding objects."""
         return bool(self.fixture.any()) and bool(self.recesses or self.protruding)
 
-    @property
+    @cached_property
     def free_recesses(self) -> tuple[Region, ...]:
         """The recesses that contain no object.
 
@@ -121,7 +133,7 @@ class Segmentation:
             if self._is_wide(item) and self._is_flat(item) and not self._is_fragment(item)
         )
 
-    @property
+    @cached_property
     def unfilled_recesses(self) -> tuple[Region, ...]:
         """The recesses into which an object might fit.
 
@@ -152,7 +164,8 @@ class Segmentation:
     def _is_wide(self, recess: Region) -> bool:
         """Whether a recess is seen, and wider than the gap around an object."""
         return bool(
-            _inner_radius(recess.mask) > max(_GAP, _LEAST_GAP / self.visibility.resolution)
+            _inner_radius(recess.mask[recess.box])
+            > max(_GAP, _LEAST_GAP / self.visibility.resolution)
             and self.visibility.seen[recess.mask].mean() > _RECESS_SEEN
         )
 
@@ -181,8 +194,9 @@ class Segmentation:
             return True
         # Leave out the pixels at the walls, which show the wall or the floor. Use depths below the
         # fixture's top, so that the floor of a tilted fixture is also flat.
-        core = ndimage.binary_erosion(recess.mask) & self.visibility.seen
-        floor = self.depth[core if core.any() else recess.mask]
+        mask = recess.mask[recess.box]
+        core = ndimage.binary_erosion(mask) & self.visibility.seen[recess.box]
+        floor = self.depth[recess.box][core if core.any() else mask]
         away = np.abs(floor - np.median(floor))
         return bool((away < max(_FLAT, 2 * self.noise)).mean() > _FLAT_SHARE)
 
