@@ -24,6 +24,10 @@ aside."""
 _ANY = math.radians(65.0)
 """If an object has no better grasp, its gripped faces may be tilted from the vertical by at most
 this, in radians."""
+_ENOUGH = 3
+"""After this number of failed picks near an object, other objects come first."""
+_NEAR = 0.06
+"""A pick closer than this to the middle of an object, in metres, was near it."""
 _IN_CAVITY = 0.03
 """An object displaced less than this from its goal, in metres, lies in or over its cavity."""
 
@@ -79,9 +83,14 @@ class ClutterExpert:
         """The action that lays one of the given objects aside; None if none can be laid aside.
 
         It prefers objects with nothing on top of them, then the least obstructed grasp, then the
-        highest object.
+        highest object. An object near which `_ENOUGH` picks failed is left for later. If there is
+        no other, all take turns.
         """
-        choices = [index for index in items if not self._covered[index]] or list(items)
+        if not items:
+            return None
+        new = [index for index in items if self._failures(index) < _ENOUGH]
+        in_turn = [items[len(self._failed) % len(items)]]
+        choices = [index for index in new if not self._covered[index]] or new or in_turn
         found = []
         for index in choices:
             top = float(self._points[index][:, 2].max())
@@ -92,6 +101,11 @@ class ClutterExpert:
             if place is not None:
                 return self._action(hold, place, 0.0, aside=True)
         return None
+
+    def _failures(self, index: int) -> int:
+        """How many picks failed near an object."""
+        x, y, _ = (self._poses[index] @ self._table.objects[index].p_BMiddle).tolist()
+        return sum(math.dist((x, y), (pick.x, pick.y)) < _NEAR for pick in self._failed)
 
     def _holds(self, index: int, X_WGoal: RigidTransform | None) -> list[HeldFromAbove]:
         in_cavity = False

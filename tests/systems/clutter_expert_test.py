@@ -136,6 +136,15 @@ def test_a_failed_grasp_is_not_repeated():
     assert action.pick.x == pytest.approx(0.525)
 
 
+def test_after_many_failed_picks_the_tools_take_turns():
+    lower, upper = pose(0.5, 0.2), pose(0.5, 0.2, math.pi / 2, z=0.0125)
+    for count, theta in ((3, math.pi / 2), (4, 0.0)):
+        failed = tuple(PlanarPose(0.5, 0.2 + 0.01 * k, 0.7) for k in range(count))
+        action = expert(lower, upper, failed=failed).aside([0, 1])
+        assert action is not None
+        assert math.remainder(action.pick.theta - theta, math.pi) == pytest.approx(0, abs=1e-6)
+
+
 def test_a_tool_the_wrong_way_up_is_turned_over_the_block():
     turned = pose(0.5, 0.2, 0.4, roll=math.pi, z=0.012)
     clutter = expert(turned)
