@@ -213,14 +213,15 @@ def test_a_wrong_path_does_not_find_a_shipped_scenario(verb: Verb, tmp_path: Pat
 
 def test_a_policy_that_raises_is_a_failure(verb: Verb, tmp_path: Path):
     scenario = tmp_path / "mine.yaml"
-    scenario.write_text('Mine: {policy: !PythonPolicy {function: "math:sqrt"}}\n')
+    scenario.write_text('Mine: {policy: !PythonPolicy {function: "my_policy:act"}}\n')
+    (tmp_path / "my_policy.py").write_text("def act(observation):\n    return observation + 1\n")
     (tmp_path / "out").mkdir()
     replay = tmp_path / "out" / "replay.html"
     replay.write_text("of an earlier run")
     done = verb("run", scenario, "--no-meshcat", "--output", tmp_path / "out")
     assert done.returncode == 1
     results = json.loads((tmp_path / "out" / "results.json").read_text())
-    assert results["failure"].startswith("TypeError: must be real number")
+    assert results["failure"].startswith("TypeError: unsupported operand")
     assert results["success_rate"] == 0.0
     assert not replay.exists()
 
