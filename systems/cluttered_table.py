@@ -58,7 +58,8 @@ _STEEPEST = math.radians(25.0)
 _SLENDER = 0.020
 """Height of a finger's slender tip, in metres."""
 _PALM_ROOM = PALM_HEIGHT - 0.002
-"""Height of the palm above the fingertips, less a margin, in metres."""
+"""Height of the palm above the fingertips, less a margin that is smaller than the room that
+`motion_heights` leaves, in metres."""
 _MARGIN = 0.001
 """Least clearance between a finger and other objects, in metres."""
 _SAME_PLACE, _SAME_ANGLE = 0.006, math.radians(15.0)

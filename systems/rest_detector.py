@@ -107,9 +107,9 @@ class RestDetector(LeafSystem):
       are those of the oriented boxes around the collision geometry, which are lower bounds.
 
     An object at rest wakes when a mover, or an object that is not at rest, comes within
-    `wake_distance`. An object that has left the cell (its distance from the world's origin is
-    `GONE` or more) is at rest at once, because a body that spins forever would overflow its
-    quaternion.
+    `wake_distance`. It then stays awake for at least 1/16 s. An object that has left the cell (its
+    distance from the world's origin is `GONE` or more) is at rest at once, because a body that
+    spins forever would overflow its quaternion.
 
     State (discrete): for each object the pose that it stays near, the time that it has stayed
     there (s), and whether it rests; the poses when distances were last tested, and how far bodies

@@ -31,7 +31,7 @@ _LARGEST = 0.001
 """The largest `preference` that counts, in metres."""
 
 
-def evidence(
+def advantage(
     depth: NDArray[np.float32],
     item: Region,
     recess: Region,
@@ -66,7 +66,7 @@ def better_half_turn(
 ) -> Registration:
     """Returns a fit, or the fit that differs from it by half a turn if that is better.
 
-    The arguments are those of `evidence`.
+    The arguments are those of `advantage`.
     """
     outline, target = outlines
     if half_turn_ratio(outline, target, fit.rotation) > _UNLIKE:
@@ -74,7 +74,7 @@ def better_half_turn(
     angle = fit.rotation + math.pi
     start = angle, target.middle - rotation_matrix(angle) @ outline.middle
     other = register(outline, target, starts=(start,))
-    is_better = evidence(depth, item, recess, outlines, other, fit) > 0
+    is_better = advantage(depth, item, recess, outlines, other, fit) > 0
     return other if is_better else fit
 
 

@@ -19,7 +19,7 @@ from scipy import ndimage
 
 from kitting_drake.policies.data.images import rotation_matrix
 from kitting_drake.policies.matching.assignment import Pair
-from kitting_drake.policies.matching.half_turn import evidence
+from kitting_drake.policies.matching.half_turn import advantage
 from kitting_drake.policies.matching.jaw_clearance import JawGrasp, jaw_grasps, untried
 from kitting_drake.policies.matching.regions.segmentation import Region, Segmentation
 from kitting_drake.policies.matching.registration import (
@@ -39,7 +39,7 @@ Array = NDArray[np.float64]
 _WORST_COST = 0.0016
 """A fit is accepted if the mean difference of the outlines is at most this, in metres."""
 _HALF_TURN_GAIN = 0.0005
-"""Another fit replaces the fit at the predicted rotation only if its `evidence` is more than
+"""Another fit replaces the fit at the predicted rotation only if its `advantage` is more than
 this."""
 _RIVAL_GAIN = 0.85
 """Another recess is chosen if its mismatch is less than this share of the predicted recess's
@@ -129,7 +129,7 @@ def refine_place(
             rivals.append(pair.fit)
     known = segmentation.depth, taken, recess, (outline, target)
     for rival in rivals:
-        if rival is not None and (best is None or evidence(*known, rival, best) > _HALF_TURN_GAIN):
+        if rival is not None and (best is None or advantage(*known, rival, best) > _HALF_TURN_GAIN):
             best = rival
     if best is None or best.cost > _WORST_COST:
         return None

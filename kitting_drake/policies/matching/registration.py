@@ -109,10 +109,10 @@ class Registration:
 
 def outline_of(region: Region, resolution: float, *, close: bool = False) -> Outline:
     """Returns the outline of a region (see `trace_outline`), which is computed only once."""
-    key = "outline", resolution, close
-    if key not in region.known:
-        region.known[key] = trace_outline(region.mask, resolution, close=close)
-    outline: Outline = region.known[key]
+    key = resolution, close
+    if key not in region.outlines:
+        region.outlines[key] = trace_outline(region.mask, resolution, close=close)
+    outline: Outline = region.outlines[key]
     return outline
 
 

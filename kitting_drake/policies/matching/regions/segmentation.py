@@ -87,8 +87,8 @@ class Region:
         return slice(low[0], high[0]), slice(low[1], high[1])
 
     @cached_property
-    def known(self) -> dict[Any, Any]:
-        """Results for this region that are computed once (see `outline_of`)."""
+    def outlines(self) -> dict[tuple[float, bool], Any]:
+        """The outlines that `outline_of` has computed, by its arguments."""
         return {}
 
 
