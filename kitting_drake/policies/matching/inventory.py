@@ -193,11 +193,18 @@ class Inventory:
 
     def tries(self, region: Region) -> int:
         """Returns how many earlier actions moved the object that lies in this region to where it
-        lies, or failed to move it away. Of several objects, the one that was left there last
+        lies, or failed to move it since then. Of several objects, the one that was left there last
         counts. Two actions that set the object down again count as one, because each shows better
         where it must be gripped."""
         last = (self._moves_of(region) or [[]])[-1]
-        here = [item.outcome for item in last if self._is_there(_left_at(item), region)]
+        # An object that was lost on its way may lie far from where it was gripped.
+        placed = [k for k, item in enumerate(last) if item.outcome == "placed"]
+        since = placed[-1] if placed else -1
+        here = [
+            item.outcome
+            for k, item in enumerate(last)
+            if k > since or self._is_there(_left_at(item), region)
+        ]
         return len(here) - (here.count("set down") + 1) // 2
 
     def named(self, action: PickPlaceAction) -> PickPlaceAction:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from manifold3d import CrossSection, Manifold
@@ -16,9 +17,11 @@ from kitting_drake.policies.matching.jaw_clearance import tip_height
 from kitting_drake.static_scenes.drawing import LooseTool, Obstacle
 from kitting_drake.tasks.kitting.convex_bodies import solid_of
 from kitting_drake.tasks.kitting.tool_poses import rectangle_at
-from systems.hand_geometry import FINGER_LENGTH, FINGERTIP_DEPTH, MAX_OPENING, PAD_LENGTH
+from systems.hand_geometry import FINGER_LENGTH, FINGERTIP_DEPTH, PAD_LENGTH
+from systems.jaw_motion import ROOM
 from systems.pick_place_parameters import PickPlaceParameters
-from systems.signals import PickPlaceAction, PlanarPose
+from systems.signals import Observation, PickPlaceAction, PlanarPose
+from systems.surface_heights import read_surface_heights
 
 Array = NDArray[np.float64]
 
@@ -35,22 +38,29 @@ PLACE_OFF = 0.0035
 at the goal."""
 
 
-def judge(action: PickPlaceAction, loose: Sequence[LooseTool], planner: PickPlaceParameters) -> str:
+def judge(
+    action: PickPlaceAction,
+    loose: Sequence[LooseTool],
+    planner: PickPlaceParameters,
+    observation: Observation,
+) -> str:
     """Judges whether an action would put a tool into its cavity.
 
     Args:
         action: the pick and place, in the world.
         loose: the tools that are not in their cavities yet.
         planner: parameters of the motion, which say how deep the fingers grip.
+        observation: the observation o_t, in which the planner measures how wide to open the jaws.
 
     Returns:
         `right`, or what is wrong: `no tool` (the action picks nothing that belongs in a cavity),
             `grasp` (the hand cannot hold the tool there) or `place` (the place is wrong).
     """
-    picked = _picked(action, loose)
+    jaws = _jaws(action, planner, observation)
+    picked, tip = _picked(jaws, loose, planner)
     if picked is None:
         return "no tool"
-    if not _is_grasp(action, picked, planner):
+    if not _is_grasp(jaws, picked, tip):
         return "grasp"
     here, there = (_outline(picked.tool.footprint, X) for X in (picked.X_WT, picked.X_WGoal))
     turn = action.place.theta - action.pick.theta
@@ -61,53 +71,82 @@ def judge(action: PickPlaceAction, loose: Sequence[LooseTool], planner: PickPlac
     return "right" if np.percentile(away, 95) <= PLACE_OFF else "place"
 
 
-def covering(action: PickPlaceAction, loose: Sequence[LooseTool]) -> list[PlanarPose]:
-    """Returns poses all over the tool that an action picks.
+def covering(
+    action: PickPlaceAction,
+    loose: Sequence[LooseTool],
+    planner: PickPlaceParameters,
+    observation: Observation,
+) -> list[PlanarPose]:
+    """Returns poses all over the tool that an action picks. The arguments are those of `judge`.
 
     A policy that gets them as failed picks takes another tool next.
     """
-    picked = _picked(action, loose)
+    picked, _ = _picked(_jaws(action, planner, observation), loose, planner)
     if picked is None:
         return [action.pick]
     points = _outline(picked.tool.footprint, picked.X_WT)[::6]
     return [action.pick, *(PlanarPose(float(x), float(y)) for x, y in points)]
 
 
-def _picked(action: PickPlaceAction, loose: Sequence[LooseTool]) -> LooseTool | None:
-    """Returns the tool with the largest part between the open jaws; None if no tool is there."""
-    pick = action.pick
-    between = rectangle_at((PAD_LENGTH, MAX_OPENING), pick.x, pick.y, pick.theta)
-    held = [(between ^ _placed(item.tool.footprint, item.X_WT)).area() for item in loose]
-    if not held or max(held) < _HELD:
-        return None
-    return loose[int(np.argmax(held))]
+@dataclass(frozen=True)
+class _Jaws:
+    """The open jaws at a pick."""
+
+    pose: PlanarPose
+    opening: float
+    """The distance between the pads, in metres."""
+
+    @property
+    def between(self) -> CrossSection:
+        """The area between the pads, seen from above."""
+        return rectangle_at((PAD_LENGTH, self.opening), self.pose.x, self.pose.y, self.pose.theta)
+
+    @property
+    def fingers(self) -> list[CrossSection]:
+        """The areas of both fingers, seen from above."""
+        side = (self.opening + FINGERTIP_DEPTH) / 2
+        across = side * np.array([-math.sin(self.pose.theta), math.cos(self.pose.theta)])
+        middles = [np.array([self.pose.x, self.pose.y]) + sign * across for sign in (1, -1)]
+        size = (FINGER_LENGTH, FINGERTIP_DEPTH)
+        return [rectangle_at(size, x, y, self.pose.theta) for x, y in middles]
 
 
-def _is_grasp(action: PickPlaceAction, picked: LooseTool, planner: PickPlaceParameters) -> bool:
-    """Whether the open fingers come down beside the tool and touch no other object."""
-    pick = action.pick
-    outline = _placed(picked.tool.footprint, picked.X_WT)
-    side = (MAX_OPENING + FINGERTIP_DEPTH) / 2
-    across = np.array([-math.sin(pick.theta), math.cos(pick.theta)])
-    tip = _tip_height(pick, picked, planner)
-    for sign in (1, -1):
-        x, y = np.array([pick.x, pick.y]) + sign * side * across
-        finger = rectangle_at((FINGER_LENGTH, FINGERTIP_DEPTH), x, y, pick.theta)
-        if (finger ^ outline).area() > _TOUCHED:
-            return False
-        if any(_touches(finger, tip, other) for other in picked.around):
-            return False
-    return True
+def _jaws(action: PickPlaceAction, planner: PickPlaceParameters, observation: Observation) -> _Jaws:
+    width = read_surface_heights(observation, action.pick, action.place).width
+    return _Jaws(action.pick, min(planner.open_width, width + 2 * ROOM))
 
 
-def _tip_height(pick: PlanarPose, picked: LooseTool, planner: PickPlaceParameters) -> float:
-    """Returns the height of the fingertips at a pick, in metres above the table."""
-    between = rectangle_at((PAD_LENGTH, MAX_OPENING), pick.x, pick.y, pick.theta)
-    held = _world_solid(picked.tool, picked.X_WT) ^ between.extrude(2 * _TALL).translate(
-        (0, 0, -_TALL)
+def _picked(
+    jaws: _Jaws, loose: Sequence[LooseTool], planner: PickPlaceParameters
+) -> tuple[LooseTool | None, float]:
+    """Returns the tool with the largest part between the pads, and the height of the fingertips in
+    metres above the table. The tool is None if there is none.
+
+    The fingertips come down beside the highest tool. What lies lower is not gripped.
+    """
+    between = jaws.between
+    column = between.extrude(2 * _TALL).translate((0, 0, -_TALL))
+    near = [
+        (item, _world_solid(item.tool, item.X_WT) ^ column)
+        for item in loose
+        if (between ^ _placed(item.tool.footprint, item.X_WT)).area() > _HELD
+    ]
+    if not near:
+        return None, 0.0
+    low, high = max((held.bounding_box()[2::3] for _, held in near), key=lambda ends: ends[1])
+    tip = float(tip_height(np.array(high), max(low, 0.0), planner))
+    gripped = [held.trim_by_plane((0, 0, 1), tip).project().area() for _, held in near]
+    return near[int(np.argmax(gripped))][0], tip
+
+
+def _is_grasp(jaws: _Jaws, picked: LooseTool, tip: float) -> bool:
+    """Whether the open fingers come down without touching the picked tool or another object."""
+    itself = Obstacle(_placed(picked.tool.footprint, picked.X_WT), picked.tool, picked.X_WT)
+    return not any(
+        _touches(finger, tip, other)
+        for finger in jaws.fingers
+        for other in (itself, *picked.around)
     )
-    low, high = (held.bounding_box()[k] for k in (2, 5))
-    return float(tip_height(np.array(high), max(low, 0.0), planner))
 
 
 def _touches(finger: CrossSection, tip: float, other: Obstacle) -> bool:

@@ -195,12 +195,14 @@ def draw_judged(first_seed: int, count: int, weights: Path | None = None) -> Ite
             tried: list[PlanarPose] = []
             for _ in range(_DECISIONS):
                 action, evidence = decide(observation, tried)
-                verdict = "stop" if action.stop else judge(action, scene.loose, planner)
+                verdict = (
+                    "stop" if action.stop else judge(action, scene.loose, planner, observation)
+                )
                 cameras = len(scene.cameras) if scene.cameras != Scenario().cameras else 0
                 yield Judged(policy, number, verdict, evidence, cameras, action.reason)
                 if action.stop:
                     break
-                tried += covering(action, scene.loose)
+                tried += covering(action, scene.loose, planner, observation)
 
 
 def _scenes(first_seed: int) -> Iterator[DrawnScene]:

@@ -136,6 +136,17 @@ def test_an_object_that_fits_is_tried_again_but_not_forever():
     assert policy(dataclasses.replace(alone, history=(missed,) * 3)).reason == "gave up"
 
 
+def test_an_object_that_is_lost_on_its_way_again_and_again_is_not_tried_forever():
+    # Each action moves the hammer by 20 mm, then the force guard stops the hand.
+    lost = [
+        dataclasses.replace(placed_at((71.0, col), pick=True, aside=False), outcome="stopped")
+        for col in (239.0, 231.0, 223.0)
+    ]
+    alone = scene((hammer(60, 180), 0.015))
+    policy = ShapeMatchingPolicy(PLANNER)
+    assert policy(dataclasses.replace(alone, history=tuple(lost))).reason == "gave up"
+
+
 @pytest.mark.parametrize(("gap", "is_tried"), [(2, False), (8, True)])
 def test_an_object_that_was_laid_beside_another_is_tried_again(gap: int, is_tried: bool):
     here, beside = np.zeros((2, *GRID.shape), bool)
