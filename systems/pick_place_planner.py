@@ -391,7 +391,13 @@ def _outcome(before: float, state: PlannerState) -> str:
         return "stopped"
     if state.doubts_grip and before == Mode.RELEASE:
         return "set down"
-    by_mode = {Mode.DESCEND: "pressed", Mode.CHECK: "missed", Mode.RELEASE: "placed"}
+    # An object that is lost in a search lies at its place.
+    by_mode = {
+        Mode.DESCEND: "pressed",
+        Mode.CHECK: "missed",
+        Mode.SEARCH: "placed",
+        Mode.RELEASE: "placed",
+    }
     return by_mode.get(Mode(int(before)), "dropped")
 
 

@@ -39,6 +39,8 @@ _STILL, _LONGEST_CHECK = 0.002, 0.4
 an object that leans or lies askew yields for a while."""
 _FIXED = 20.0
 """If the closed jaws feel a lateral force above this at rest, in N, they grip something fixed."""
+_LEAST_SINK = 0.001
+"""There is no search for a cavity into which the object could sink by less than this, in m."""
 _STUCK = 0.004
 """If the opening of the jaws stays below its goal by more than this, in m, they stick to the
 object."""
@@ -361,10 +363,14 @@ class PickPlaceSteps:
             self._motion.begin(state, Mode.RETREAT, time, opening=opening)
 
     def _is_blocked(self, state: PlannerState, hand: NDArray[np.float64]) -> bool:
+        """Whether the object stands on the rim of a cavity, and can sink in before the fingertips
+        touch the rim."""
         bottom = hand[2] - state.hold_z + state.support_z
         left = state.search_step < self._search_steps
         search, rim, table = self._parameters.search, float(state.rim_z), float(state.table_z)
-        return left and search.is_on_rim(float(bottom), rim, table)
+        doubt = float(state.doubt)
+        has_room = hand[2] > rim + doubt + max(_LEAST_SINK, doubt)
+        return bool(left and has_room and search.is_on_rim(float(bottom), rim, table))
 
     def _is_held(self, hand: NDArray[np.float64], contact: NDArray[np.float64]) -> bool:
         # A held object pushes the fingers apart, along their positive axes.

@@ -310,7 +310,7 @@ class LeftOver:
 OUTCOMES = ("placed", "missed", "dropped", "pressed", "stopped", "set down", "unreachable")
 """The outcomes of an action:
 
-- placed: the object was let go at its place.
+- placed: the object was let go at its place, or lost there in a search.
 - missed: nothing was grasped.
 - dropped: the object was lost on the way.
 - pressed: the object was pressed down.

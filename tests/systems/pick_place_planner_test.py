@@ -465,6 +465,15 @@ def test_no_search_is_made(touched: float, insertion: bool, amplitude: float):
     assert run.sequence == [*PICK_AND_PLACE, Mode.OBSERVE, Mode.DONE]
 
 
+@pytest.mark.parametrize(("doubt", "searches"), [(0.0, True), (0.002, False)])
+def test_no_search_is_made_if_the_fingertips_may_touch_the_rim(doubt: float, searches: bool):
+    """A thin object can sink by 1.5 mm at most, which is less than the doubt of the heights."""
+    thin = dataclasses.replace(HEIGHTS, pick_top=0.008, place_rim=RIM, doubt=doubt)
+    world = World(touch_place=PARAMETERS.floor_clearance + RIM)
+    run = Run(world, answer=dataclasses.replace(ACTION, heights=thin), insertion=True).finish()
+    assert (Mode.SEARCH in run.sequence) is searches
+
+
 def test_an_object_placed_on_the_table_is_released_without_a_search():
     """There is no search even in insertion tasks, because the table has no cavity."""
     run = Run(World(touch_place=GRASP_Z), insertion=True).finish()
@@ -660,6 +669,8 @@ def test_an_object_dropped_while_searching_is_counted():
     world = World(touch_place=ON_THE_RIM, width=width)
     run = Run(world, answer=OVER_A_CAVITY, insertion=True).until(Mode.RETREAT)
     assert run.sequence[-2:] == [Mode.SEARCH, Mode.RETREAT]
+    # It lies at its place, where the policy must look for it.
+    assert [item.outcome for item in run.output("history")] == ["placed"]
     assert run.finish().counts == [1, 0, 1]
 
 

@@ -247,6 +247,22 @@ class Inventory:
                 return True
         return False
 
+    def misplacement(self, region: Region) -> NDArray[np.float64] | None:
+        """Returns how far (rows, columns) an object lies from where an action let it go in the kit.
+
+        Returns None if this is not known: the object was not placed there, or was moved within the
+        kit before, or several placed objects lie in the region.
+        """
+        moves = self._moves_of(region)
+        placing = [item for item in moves[0] if item.outcome != "pressed"] if moves else []
+        if len(moves) != 1 or not placing or placing[-1].outcome != "placed":
+            return None
+        last = placing[-1].action
+        if last.aside or self._is_on_fixture(last.pick) or not self._is_on_fixture(last.place):
+            return None
+        meant = self.observation.grid.to_pixel(_middle_left_at(placing[-1]))
+        return np.asarray(region.pixels.mean(axis=0) - meant)
+
     @property
     def unseated(self) -> tuple[PlanarPose, ...]:
         """The places in the kit where an object was let go and does not stand on the floor: it is

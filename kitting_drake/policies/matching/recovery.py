@@ -1,9 +1,11 @@
 """Corrects a failed insertion that the next o_t shows.
 
-An object that protrudes from the fixture is not seated. If it protrudes a little, it is pressed
-down once. If it protrudes more, or pressing did not help, it is taken out and laid on the table to
-be tried again. An object that is jammed below the rim is pressed down once. This uses only heights
-and is not in the paper.
+An object that protrudes from the fixture is not seated. If it lies a little beside its place, it is
+moved there: such a short motion is more exact than the first one, in which an error of the cameras'
+calibration counts twice if the object is rotated by half a turn. If it protrudes a little, it is
+pressed down once. If it protrudes more, or this did not help, it is taken out and laid on the table
+to be tried again. An object that is jammed below the rim is pressed down once. This uses only
+heights and is not in the paper.
 """
 
 from __future__ import annotations
@@ -28,6 +30,9 @@ Array = NDArray[np.float64]
 
 _PRESSED = 0.012
 """An object that protrudes by more than this, in metres, is taken out rather than pressed down."""
+_BESIDE = (0.003, 0.012)
+"""An object that lies beside its place by a distance in this range, in metres, is moved there. Less
+is not why it protrudes. More is measured badly, because a part of the object is hidden."""
 _BELOW = 0.0015
 """An object in a recess is below the fixture's top by more than this, in metres."""
 _FAR = 0.75
@@ -43,8 +48,8 @@ _ROOM = 0.045
 def recovery_action(
     inventory: Inventory, planner: PickPlaceParameters, tried: Sequence[PlanarPose] = ()
 ) -> PickPlaceAction | None:
-    """Returns an action that presses down or takes out a protruding object; None if no object
-    protrudes or no correction is feasible.
+    """Returns an action that moves, presses down or takes out a protruding object; None if no
+    object protrudes or no correction is feasible.
 
     Objects that protrude more come first. An object that was already taken out and placed again is
     not taken out once more.
@@ -57,6 +62,9 @@ def recovery_action(
     observation, segmentation = inventory.observation, inventory.segmentation
     pickable = segmentation.visibility.pickable
     for region in segmentation.protruding:
+        moved = _move_to_place(inventory, region, planner, tried)
+        if moved is not None:
+            return moved
         if region.height <= _PRESSED and pickable[region.mask].any():
             pressed = _press(observation, segmentation, region, pickable)
             if not _is_near(pressed.pick, tried):
@@ -123,8 +131,7 @@ def _take_out(
     free = _free_place(segmentation, resolution)
     if free is None:
         return None
-    around = ndimage.binary_dilation(region.mask, iterations=_NEARBY) & segmentation.fixture
-    top = float(np.median(segmentation.relief[around & ~region.mask]))
+    top = _top_around(segmentation, region)
     # If the region is several entangled objects, often only the topmost can be gripped.
     for part in (region, *topmost_layers(segmentation, region)):
         for grasp in jaw_grasps(segmentation, part, resolution, planner, support=top):
@@ -132,6 +139,33 @@ def _take_out(
             if not _is_near(action.pick, tried) and not inventory.was_removed(part):
                 return replace(action, aside=True)
     return None
+
+
+def _move_to_place(
+    inventory: Inventory,
+    region: Region,
+    planner: PickPlaceParameters,
+    tried: Sequence[PlanarPose],
+) -> PickPlaceAction | None:
+    """Returns an action that moves a protruding object to the place from which it is off by a
+    distance in the range `_BESIDE`; None if there is no such action."""
+    observation, segmentation = inventory.observation, inventory.segmentation
+    resolution = observation.grid.resolution
+    off = inventory.misplacement(region)
+    if off is None or not _BESIDE[0] < np.linalg.norm(off) * resolution < _BESIDE[1]:
+        return None
+    top = _top_around(segmentation, region)
+    for grasp in jaw_grasps(segmentation, region, resolution, planner, support=top):
+        action = make_action(observation, grasp.pixel, grasp.theta, grasp.pixel - off, 0.0)
+        if not _is_near(action.pick, tried):
+            return action
+    return None
+
+
+def _top_around(segmentation: Segmentation, region: Region) -> float:
+    """The height of the fixture's top around an object, in metres above the table."""
+    around = ndimage.binary_dilation(region.mask, iterations=_NEARBY) & segmentation.fixture
+    return float(np.median(segmentation.relief[around & ~region.mask]))
 
 
 def _free_place(segmentation: Segmentation, resolution: float) -> Array | None:

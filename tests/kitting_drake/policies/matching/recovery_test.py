@@ -164,3 +164,22 @@ def test_an_object_that_is_jammed_below_the_rim_is_pressed_once_at_its_far_end(
         row, col = GRID.to_pixel((action.pick.x, action.pick.y))
         assert 61 < row < 64 and 105 < col < 124
         assert mending(seen, [action.pick]) is None
+
+
+@pytest.mark.parametrize(("off", "moves"), [(1.0, True), (2.5, True), (0.3, False), (6.0, False)])
+def test_an_object_that_lies_a_little_beside_its_place_is_moved_there_once(off: float, moves: bool):
+    lies, table = (93.5, 99.5), (60.0, 240.0)
+    meant = (lies[0] - off, lies[1])
+    placed = move(table, meant, aside=False)
+    seen = dataclasses.replace(observed(0.014), history=(placed,))
+    action = mending(seen)
+    assert action is not None
+    assert action.aside is not moves
+    if not moves:
+        return
+    way = np.subtract(*(GRID.to_pixel((pose.x, pose.y)) for pose in (action.place, action.pick)))
+    np.testing.assert_allclose(way, (-off, 0.0), atol=0.3)
+    assert action.place.theta == action.pick.theta
+    # If it still protrudes, it is taken out.
+    again = dataclasses.replace(seen, history=(placed, move(lies, meant, aside=False)))
+    assert mending(again).aside
