@@ -194,9 +194,9 @@ class Learned(PolicyConfig):
 
     # Whether to correct failed insertions, take heaps apart and turn objects over. The policy first
     # presses down protruding objects. Then it picks objects that fit into a recess. When none is
-    # left, it takes objects off other objects, then takes out objects that could not be pressed
-    # down, and then turns over objects that lie upside down. No object is taken out twice. Recovery
-    # needs extra actions: see the task's `tries`.
+    # left, it takes objects off other objects, then moves misplaced objects to their place, takes
+    # out objects that could not be pressed down, and turns over objects that lie upside down. No
+    # object is taken out twice. Recovery needs extra actions: see the task's `tries`.
     recover: bool = False
 
     def make_system(self, site: PolicySite) -> LeafSystem:
