@@ -305,7 +305,7 @@ class PickPlacePlanner(LeafSystem):
 
     def _conclude(self, before: float, state: PlannerState, discrete_state: DiscreteValues) -> None:
         """Writes the present action into the history when the hand begins to retreat."""
-        if state.mode == Mode.RETREAT and before != Mode.RETREAT:
+        if state.mode == Mode.RETREAT and before != Mode.RETREAT and not state.layings:
             history = AttemptHistory(discrete_state.get_mutable_value(self._history_index))
             outcome = _outcome(before, state)
             balance = _balance(state) if outcome == "set down" else None
@@ -336,7 +336,7 @@ class PickPlacePlanner(LeafSystem):
             state.place_hover_z = max(hover, min(hover + _ASIDE, float(state.travel_z)))
         state.search_step, state.press, state.aside = 0, action.press, action.aside
         state.middle = np.nan if action.middle is None else action.middle
-        state.stops = state.doubts_grip = 0
+        state.stops = state.doubts_grip = state.layings = state.lowers_next = 0
         kept = AttemptHistory(discrete_state.get_mutable_value(self._history_index))
         state.set_downs = kept.set_downs(action.pick)
         state.actions += 1

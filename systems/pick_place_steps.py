@@ -41,6 +41,15 @@ _FIXED = 20.0
 """If the closed jaws feel a lateral force above this at rest, in N, they grip something fixed."""
 _LEAST_SINK = 0.001
 """There is no search for a cavity into which the object could sink by less than this, in m."""
+_CARRIED = 0.5
+"""If the rising hand feels a downward force above this, in N, it still carries an object."""
+_FELT_FOR = 1 / 32
+"""For how long this force must last, in s."""
+_RISEN_CLEAR, _RISEN_FAR = 0.02, 0.15
+"""How far the hand has risen by then at least and at most, in m. Below the first height it may
+still brush against the object."""
+_MOST_LAYINGS = 2
+"""How often the hand goes down again to rid itself of an object."""
 _STUCK = 0.004
 """If the opening of the jaws stays below its goal by more than this, in m, they stick to the
 object."""
@@ -117,11 +126,51 @@ class PickPlaceSteps:
             acceleration: (3) commanded acceleration of the hand in the world, in m/s^2.
         """
         state, hand = moment.state, moment.hand
+        if state.mode != Mode.RETREAT:
+            state.let_go_z, state.carries_since = hand[2], np.inf
         must_stop = self._guard.feel(state, moment.contact, float(hand[2]), acceleration)
         if must_stop and not state.stops:
             self.stop(moment)
         elif state.mode in (Mode.DESCEND, Mode.LOWER):
             self.step(moment)
+        elif state.mode == Mode.RETREAT:
+            self._feel_load(moment)
+
+    def _feel_load(self, moment: Moment) -> None:
+        """Goes down again if an object that should have been let go still hangs on the hand."""
+        state, time = moment.state, moment.time
+        risen = moment.hand[2] - state.let_go_z
+        if moment.contact[2] > -_CARRIED or risen < _RISEN_CLEAR:
+            state.carries_since = np.inf
+            return
+        state.carries_since = min(float(state.carries_since), time)
+        lasts = time - state.carries_since >= _FELT_FOR
+        if lasts and risen < _RISEN_FAR and state.layings < _MOST_LAYINGS:
+            state.layings += 1
+            state.lowers_next = 1
+            # Brake first.
+            self._motion.begin(state, Mode.RELEASE, time)
+            state.goal_opening = state.start_opening
+
+    def _lower_again(self, moment: Moment) -> None:
+        """Begins to lower an object that hangs on the hand. It hangs by an unknown length, so the
+        hand moves slowly and stops at the first contact."""
+        state = moment.state
+        state.lowers_next = 0
+        self._guard.tare(state, moment.contact, self._parameters.contact_threshold)
+        state.floor_z, state.rim_z = state.travel_z, state.table_z
+        self._motion.begin(state, Mode.LOWER, moment.time)
+
+    def _lay_down(self, moment: Moment) -> None:
+        """Lets go of an object that hung on the hand, after it was lowered again.
+
+        The jaws open fully. The second time they close half of the way instead, because a finger
+        may be wedged between two parts of the object.
+        """
+        state, opening = moment.state, float(moment.hand[4] + moment.hand[5])
+        self._motion.begin(state, Mode.RELEASE, moment.time, opening=opening)
+        first = state.layings == 1
+        state.goal_opening = self._parameters.open_width if first else opening / 2
 
     def stop(self, moment: Moment) -> None:
         """Stops the hand at once, lets go of the object in it, and retreats."""
@@ -279,8 +328,7 @@ class PickPlaceSteps:
             # Brake, and continue when the grip is firm.
             self._motion.begin(state, Mode.LIFT, time)
         if not self._is_held(hand, contact):
-            state.dropped += 1
-            self._motion.begin(state, Mode.RETREAT, time)
+            self._lose(moment)
         elif state.mode == Mode.LIFT:
             if self._motion.brakes_above(state, time, state.travel_z):
                 # An object that hangs lower than planned must first rise by as much.
@@ -291,6 +339,16 @@ class PickPlaceSteps:
         elif time >= self._motion.arrival(state) + self._settle:
             self._guard.tare(state, contact, self._parameters.contact_threshold)
             self._motion.begin(state, Mode.LOWER, time)
+
+    def _lose(self, moment: Moment) -> None:
+        """Retreats without the object, which was lost.
+
+        The jaws stay as they are. If they opened inside a ring, they would lift it.
+        """
+        state, hand = moment.state, moment.hand
+        state.dropped += 1
+        opening = max(float(hand[4] + hand[5]), 0.0)
+        self._motion.begin(state, Mode.RETREAT, moment.time, opening=opening)
 
     def _hangs_lower(self, moment: Moment, weight: float) -> bool:
         """Whether the object proves to hang lower while the hand, in `CARRY`, still rises."""
@@ -321,9 +379,12 @@ class PickPlaceSteps:
     def lower(self, moment: Moment) -> None:
         """Lowers the object until contact. Begins the search if it then stands on a rim."""
         state, time, hand, contact = moment.state, moment.time, moment.hand, moment.contact
-        if not self._is_held(hand, contact):
-            state.dropped += 1
-            self._motion.begin(state, Mode.RETREAT, time)
+        if state.layings:
+            touches = state.recent[Z] > self._parameters.contact_threshold
+            if touches or time >= self._motion.arrival(state):
+                self._lay_down(moment)
+        elif not self._is_held(hand, contact):
+            self._lose(moment)
         elif state.recent[Z] > self._parameters.contact_threshold:
             if self._is_blocked(state, hand):
                 state.touch_z = hand[2]
@@ -338,8 +399,7 @@ class PickPlaceSteps:
         state, time, hand, contact = moment.state, moment.time, moment.hand, moment.contact
         free = state.recent[Z] < self._parameters.contact_threshold / 2
         if not self._is_held(hand, contact):
-            state.dropped += 1
-            self._motion.begin(state, Mode.RETREAT, time)
+            self._lose(moment)
         elif free and self._parameters.search.has_slipped_in(hand[2], state.touch_z):
             # The object has found its cavity: stop here without braking, and lower it.
             self._motion.begin(state, Mode.LOWER, time, z=hand[2])
@@ -354,7 +414,10 @@ class PickPlaceSteps:
         """Opens the jaws, with force if they stick, and goes on when they have opened."""
         state, time, hand = moment.state, moment.time, moment.hand
         opening = hand[4] + hand[5]
-        if opening >= state.goal_opening - _STUCK or time < self._motion.arrival(state):
+        if state.lowers_next:
+            if time >= self._motion.arrival(state):
+                self._lower_again(moment)
+        elif opening >= state.goal_opening - _STUCK or time < self._motion.arrival(state):
             self.follow(moment)
         elif time < state.start_time + _LONGEST_RELEASE:
             self._motion.set_force(state, time, -_PUSH * self._parameters.grasp_force)

@@ -110,6 +110,14 @@ class PlannerState(VectorView):
     """1 if the action lays the object aside, else 0."""
     middle = Array(2)
     """The action's `middle`, in m; NaN if it is None."""
+    let_go_z = Number()
+    """Height of the fingertips when the hand began to retreat. `carries_since` is the time since
+    which it has felt the weight of an object in the retreat; infinite if it feels none."""
+    carries_since = Number()
+    layings = Number()
+    """How often the hand went down again in this action, to rid itself of an object."""
+    lowers_next = Number()
+    """1 while the hand brakes before it goes down again, else 0."""
     lever = Number()
     """Position of the object's centre of mass relative to the pads' middle, along the pads, in m.
     It is recorded in the history if the object is set down again."""

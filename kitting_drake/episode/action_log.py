@@ -76,7 +76,7 @@ class ActionLog:
         elif event.mode == Mode.RELEASE:
             self.records[-1].outcome = "placed"
         elif event.mode == Mode.RETREAT and event.previous == Mode.RELEASE:
-            self._note_set_down(event)
+            self._note_outcome(event)
         elif event.mode == Mode.RETREAT and event.previous == Mode.DESCEND:
             self.records[-1] = dataclasses.replace(
                 self.records[-1],
@@ -90,10 +90,11 @@ class ActionLog:
             by_mode = {Mode.APPROACH: "unreachable", Mode.CHECK: "missed"}
             self.records[-1].outcome = by_mode.get(event.previous, "dropped")
 
-    def _note_set_down(self, event: ModeChange) -> None:
+    def _note_outcome(self, event: ModeChange) -> None:
+        # The object may have been set down again, or lost before the hand let go of it.
         history = self._station.history(event.root_context)
-        if history and history[-1].outcome == "set down" and self.records:
-            self.records[-1].outcome = "set down"
+        if history and self.records:
+            self.records[-1].outcome = history[-1].outcome
 
     def _find_lifted(self, event: ModeChange) -> None:
         now = self._station.object_poses(event.root_context)

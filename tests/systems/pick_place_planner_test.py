@@ -674,6 +674,16 @@ def test_an_object_dropped_while_searching_is_counted():
     assert run.finish().counts == [1, 0, 1]
 
 
+@pytest.mark.parametrize(("force", "layings"), [(-2.0, 2), (-0.3, 0)])
+def test_the_hand_goes_down_again_if_an_object_hangs_on_it(force: float, layings: int):
+    """It does so twice at most, because a sensor may be wrong."""
+    run = Run(Jam(mode=Mode.RETREAT, force=(0.0, 0.0, force))).finish()
+    again = [Mode.RELEASE, Mode.LOWER, Mode.RELEASE, Mode.RETREAT]
+    assert run.sequence == [*PICK_AND_PLACE, *layings * again, Mode.OBSERVE, Mode.DONE]
+    assert [item.outcome for item in run.output("history")] == ["placed"]
+    assert run.counts == [1, 0, 0]
+
+
 @pytest.mark.parametrize("where", [Mode.LIFT, Mode.CARRY, Mode.LOWER])
 def test_a_dropped_object_is_counted_and_retried(where: Mode):
     def width(attempt: int, mode: Mode) -> float:
