@@ -24,10 +24,11 @@ WIDTH, FLOOR = 0.02, 0.004
 
 class PerfectArm(LeafSystem):
     """Follows the desired motion, stops the jaws at the object, and measures the contact forces
-    of the pads and the floor."""
+    of the pads and the floor. In a retreat something pulls on the hand with a force of `load`."""
 
-    def __init__(self) -> None:
+    def __init__(self, load: float) -> None:
         super().__init__()
+        self._load = load
         for name, size in (("motion", 21), ("opening", 2), ("force", 1), ("mode", 1)):
             self.DeclareVectorInputPort(name, size)
         self.DeclareVectorOutputPort("hand_state", 12, self._calc_state)
@@ -50,7 +51,8 @@ class PerfectArm(LeafSystem):
         opening, press = self.GetInputPort("opening").Eval(context)[0], self.GetInputPort("force")
         pad = press.Eval(context)[0] + 400 * (WIDTH - opening) if opening <= WIDTH else 0.0
         touch = 1e4 * max(FLOOR - z, 0.0) if mode >= Mode.LOWER else 0.0
-        output.SetFromVector([0, 0, touch, 0, pad, pad])
+        pull = self._load if mode == Mode.RETREAT else 0.0
+        output.SetFromVector([0, 0, touch - pull, 0, pad, pad])
 
 
 class TwoActions(LeafSystem):
@@ -70,7 +72,7 @@ class TwoActions(LeafSystem):
         output.set_value(self._answers[int(self.GetInputPort("counts").Eval(context)[0])])
 
 
-def run() -> tuple[list[Mode], tuple, np.ndarray]:
+def run(load: float = 0.0) -> tuple[list[Mode], tuple, np.ndarray]:
     """The modes of an episode, its attempts, and the commanded motion at each step."""
     builder = DiagramBuilder()
     planner = builder.AddSystem(
@@ -78,7 +80,7 @@ def run() -> tuple[list[Mode], tuple, np.ndarray]:
             parameters=PARAMETERS, max_actions=5, motion=ArmMotion(PARAMETERS, FR3, BASE)
         )
     )
-    arm, policy = builder.AddSystem(PerfectArm()), builder.AddSystem(TwoActions())
+    arm, policy = builder.AddSystem(PerfectArm(load)), builder.AddSystem(TwoActions())
     for source, target in (
         ("desired_motion", "motion"),
         ("desired_opening", "opening"),
@@ -124,6 +126,17 @@ def test_an_arm_does_what_it_can_reach_and_refuses_the_rest():
     # During the first action, which is refused, the arm does not move.
     moving = np.flatnonzero(np.abs(motions[:, 7:14]).max(axis=1) > 0)
     assert moving[0] / 128 > 0.2
+
+
+def test_an_arm_goes_down_again_if_an_object_hangs_on_its_hand():
+    modes, history, motions = run(load=2.0)
+    again = [Mode.RELEASE, Mode.LOWER, Mode.RELEASE, Mode.RETREAT]
+    last = [mode for mode in Mode if mode < Mode.DONE]
+    assert modes[3:] == [*last, *again, *again, Mode.OBSERVE, Mode.DONE]
+    assert [attempt.outcome for attempt in history] == ["unreachable", "placed"]
+    # The arm brakes before it goes down: it never jumps.
+    assert (np.abs(motions[:, 7:14]) <= FR3.velocity).all()
+    assert np.abs(np.diff(motions[:, :7], axis=0)).max() < 0.025
 
 
 @pytest.mark.slow
