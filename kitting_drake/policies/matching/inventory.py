@@ -26,6 +26,8 @@ was picked or placed there."""
 _SAME_OBJECT = 0.060
 """If an object was left closer than this to a later pick, in metres, that pick was of this
 object."""
+_LOST = ("dropped", "stopped")
+"""The outcomes of actions that lose an object on its way."""
 _OBSTRUCTED = 0.05
 """A place is obstructed if more than this share of the object would lie on protruding things."""
 _NOT_SEATED, _NOISE = 0.001, 4.0
@@ -289,8 +291,15 @@ class Inventory:
 
     def _moves_of(self, region: Region) -> list[list[Attempt]]:
         """Returns the earlier actions on each object that was left in a region, oldest first. The
-        object that was left there last comes last."""
-        return [moves for moves in self._moves if self._is_there(_left_at(moves[-1]), region)]
+        object that was left there last comes last.
+
+        An object that was lost on its way lies beside where it was gripped.
+        """
+        found = [moves for moves in self._moves if self._is_there(_left_at(moves[-1]), region)]
+        nearest = None if found else _nearest(self._moves, self._middle(region))
+        if nearest is not None and self._moves[nearest][-1].outcome in _LOST:
+            return [self._moves[nearest]]
+        return found
 
     @cached_property
     def _moves(self) -> list[list[Attempt]]:

@@ -136,11 +136,15 @@ def test_an_object_that_fits_is_tried_again_but_not_forever():
     assert policy(dataclasses.replace(alone, history=(missed,) * 3)).reason == "gave up"
 
 
-def test_an_object_that_is_lost_on_its_way_again_and_again_is_not_tried_forever():
-    # Each action moves the hammer by 20 mm, then the force guard stops the hand.
+@pytest.mark.parametrize("way", [(0.0, -8.0), (7.0, 0.0)])
+def test_an_object_that_is_lost_on_its_way_again_and_again_is_not_tried_forever(
+    way: tuple[float, float],
+):
+    # Each action moves the hammer by about 20 mm, then the force guard stops the hand.
+    starts = [np.array((71.0, 215.0)) - k * np.array(way) for k in (3, 2, 1)]
     lost = [
-        dataclasses.replace(placed_at((71.0, col), pick=True, aside=False), outcome="stopped")
-        for col in (239.0, 231.0, 223.0)
+        dataclasses.replace(placed_at(tuple(start), pick=True, aside=False), outcome="stopped")
+        for start in starts
     ]
     alone = scene((hammer(60, 180), 0.015))
     policy = ShapeMatchingPolicy(PLANNER)
