@@ -1,11 +1,11 @@
 """Corrects a failed insertion that the next o_t shows.
 
-An object that protrudes from the fixture is not seated. If it lies a little beside its place, it is
-moved there: such a short motion is more exact than the first one, in which an error of the cameras'
-calibration counts twice if the object is rotated by half a turn. If it protrudes a little, it is
-pressed down once. If it protrudes more, or this did not help, it is taken out and laid on the table
-to be tried again. An object that is jammed below the rim is pressed down once. This uses only
-heights and is not in the paper.
+An object that protrudes from the fixture is not seated. If it protrudes a little, it is pressed
+down once. If it protrudes more, or this did not help, it is moved to its place if it lies a little
+beside it: such a short motion is more exact than the first one, in which an error of the cameras'
+calibration counts twice if the object is rotated by half a turn. Else it is taken out and laid on
+the table to be tried again. An object that is jammed below the rim is pressed down once. This uses
+only heights and is not in the paper.
 """
 
 from __future__ import annotations
@@ -62,16 +62,15 @@ def recovery_action(
     observation, segmentation = inventory.observation, inventory.segmentation
     pickable = segmentation.visibility.pickable
     for region in segmentation.protruding:
-        moved = _move_to_place(inventory, region, planner, tried)
-        if moved is not None:
-            return moved
         if region.height <= _PRESSED and pickable[region.mask].any():
             pressed = _press(observation, segmentation, region, pickable)
             if not _is_near(pressed.pick, tried):
                 return pressed
-        taken = _take_out(inventory, region, planner, tried)
-        if taken is not None:
-            return taken
+        mended = _move_to_place(inventory, region, planner, tried) or _take_out(
+            inventory, region, planner, tried
+        )
+        if mended is not None:
+            return mended
     for place in inventory.unseated:
         pressed = _press_far_end(observation, segmentation, place)
         if not _is_near(pressed.pick, tried):
