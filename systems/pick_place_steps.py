@@ -343,12 +343,12 @@ class PickPlaceSteps:
     def _lose(self, moment: Moment) -> None:
         """Retreats without the object, which was lost.
 
-        The jaws stay as they are. If they opened inside a ring, they would lift it.
+        Jaws that have closed stay closed: if they opened inside a ring, they would lift it.
         """
-        state, hand = moment.state, moment.hand
+        state, opening = moment.state, float(moment.hand[4] + moment.hand[5])
         state.dropped += 1
-        opening = max(float(hand[4] + hand[5]), 0.0)
-        self._motion.begin(state, Mode.RETREAT, moment.time, opening=opening)
+        kept = max(opening, 0.0) if opening < _STUCK else None
+        self._motion.begin(state, Mode.RETREAT, moment.time, opening=kept)
 
     def _hangs_lower(self, moment: Moment, weight: float) -> bool:
         """Whether the object proves to hang lower while the hand, in `CARRY`, still rises."""
