@@ -277,7 +277,8 @@ class PickPlacePlanner(LeafSystem):
         acceleration = self._motion.hand_acceleration(state, moment.time, desired)
         self._steps.feel(moment, acceleration)
         self._conclude(before[0], state, discrete_state)
-        if before[0] == Mode.RETREAT and before[1:] != (state.stops, _peak(state)):
+        goes_on = before[0] == Mode.RETREAT or state.layings
+        if goes_on and before[1:] != (state.stops, _peak(state)):
             history = AttemptHistory(discrete_state.get_mutable_value(self._history_index))
             history.amend("stopped" if state.stops else None, _peak(state))
         return EventStatus.Succeeded()

@@ -42,12 +42,14 @@ _FIXED = 20.0
 _LEAST_SINK = 0.001
 """There is no search for a cavity into which the object could sink by less than this, in m."""
 _CARRIED = 0.5
-"""If the rising hand feels a downward force above this, in N, it still carries an object."""
+"""If something pulls the rising hand down with more than this, in N, the hand still carries an
+object."""
 _FELT_FOR = 1 / 32
-"""For how long this force must last, in s."""
-_RISEN_CLEAR, _RISEN_FAR = 0.02, 0.15
-"""How far the hand has risen by then at least and at most, in m. Below the first height it may
-still brush against the object."""
+"""The pull must last for this time, in s."""
+_LEAST_RISE, _MOST_RISE = 0.02, 0.15
+"""The pull counts if the hand has risen by more than the first length, in m, because below it the
+hand may brush against the object. The hand goes down again if it has risen by less than the
+second."""
 _MOST_LAYINGS = 2
 """How often the hand goes down again to rid itself of an object."""
 _STUCK = 0.004
@@ -119,7 +121,7 @@ class PickPlaceSteps:
         """Watches the contact force. Call it at every step of the plant.
 
         The steps of `DESCEND` and `LOWER` are executed here as well, so that these motions stop
-        soon after a contact.
+        soon after a contact. In `RETREAT` the hand feels whether it still carries an object.
 
         Args:
             moment: the inputs.
@@ -140,24 +142,24 @@ class PickPlaceSteps:
         """Goes down again if an object that should have been let go still hangs on the hand."""
         state, time = moment.state, moment.time
         risen = moment.hand[2] - state.let_go_z
-        if moment.contact[2] > -_CARRIED or risen < _RISEN_CLEAR:
+        if moment.contact[2] > -_CARRIED or risen < _LEAST_RISE:
             state.carries_since = np.inf
             return
         state.carries_since = min(float(state.carries_since), time)
-        lasts = time - state.carries_since >= _FELT_FOR
-        if lasts and risen < _RISEN_FAR and state.layings < _MOST_LAYINGS:
+        lasts = time - state.carries_since >= _FELT_FOR and risen < _MOST_RISE
+        if lasts and state.layings < _MOST_LAYINGS and not state.stops and not state.press:
             state.layings += 1
-            state.lowers_next = 1
             # Brake first.
+            state.lowers_next = 1
             self._motion.begin(state, Mode.RELEASE, time)
             state.goal_opening = state.start_opening
 
     def _lower_again(self, moment: Moment) -> None:
-        """Begins to lower an object that hangs on the hand. It hangs by an unknown length, so the
-        hand moves slowly and stops at the first contact."""
+        """Begins to lower an object that hangs on the resting hand. It hangs by an unknown length,
+        so the hand moves slowly and stops at the first contact."""
         state = moment.state
         state.lowers_next = 0
-        self._guard.tare(state, moment.contact, self._parameters.contact_threshold)
+        state.payload = min(float(moment.contact[2]), 0.0)
         state.floor_z, state.rim_z = state.travel_z, state.table_z
         self._motion.begin(state, Mode.LOWER, moment.time)
 
@@ -176,6 +178,7 @@ class PickPlaceSteps:
         """Stops the hand at once, lets go of the object in it, and retreats."""
         state = moment.state
         state.stopped, state.stops = state.stopped + 1, 1
+        state.lowers_next = 0
         retreats, holds = state.mode == Mode.RETREAT, state.mode in _HOLDING
         following = Mode.RELEASE if holds else Mode.RETREAT
         self._motion.begin(state, following, moment.time, at=moment.hand[:4])
@@ -415,8 +418,13 @@ class PickPlaceSteps:
         state, time, hand = moment.state, moment.time, moment.hand
         opening = hand[4] + hand[5]
         if state.lowers_next:
-            if time >= self._motion.arrival(state):
+            if time >= self._motion.arrival(state) + self._settle:
                 self._lower_again(moment)
+        elif state.layings > 1:
+            # Jaws that close must not clamp what is between them.
+            if time >= self._motion.arrival(state):
+                kept = max(float(opening), float(state.goal_opening))
+                self._motion.begin(state, Mode.RETREAT, time, opening=kept)
         elif opening >= state.goal_opening - _STUCK or time < self._motion.arrival(state):
             self.follow(moment)
         elif time < state.start_time + _LONGEST_RELEASE:

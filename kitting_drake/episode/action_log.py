@@ -75,26 +75,30 @@ class ActionLog:
             return
         elif event.mode == Mode.RELEASE:
             self.records[-1].outcome = "placed"
-        elif event.mode == Mode.RETREAT and event.previous == Mode.RELEASE:
-            self._note_outcome(event)
-        elif event.mode == Mode.RETREAT and event.previous == Mode.DESCEND:
-            self.records[-1] = dataclasses.replace(
-                self.records[-1],
-                outcome="pressed",
-                pick_position_error_mm=None,
-                pick_angle_error_deg=None,
-                place_position_error_mm=None,
-                place_angle_error_deg=None,
-            )
-        elif event.mode == Mode.RETREAT and event.previous != Mode.RELEASE:
-            by_mode = {Mode.APPROACH: "unreachable", Mode.CHECK: "missed"}
-            self.records[-1].outcome = by_mode.get(event.previous, "dropped")
+        elif event.mode == Mode.RETREAT and self.records:
+            self.records[-1].outcome = self._outcome(event)
+            if event.previous == Mode.DESCEND:
+                self.records[-1] = dataclasses.replace(
+                    self.records[-1],
+                    pick_position_error_mm=None,
+                    pick_angle_error_deg=None,
+                    place_position_error_mm=None,
+                    place_angle_error_deg=None,
+                )
 
-    def _note_outcome(self, event: ModeChange) -> None:
-        # The object may have been set down again, or lost before the hand let go of it.
+    def _outcome(self, event: ModeChange) -> str:
+        """The outcome of the present action, when the hand retreats: as the planner has recorded
+        it, else as the modes show it."""
         history = self._station.history(event.root_context)
-        if history and self.records:
-            self.records[-1].outcome = history[-1].outcome
+        if history:
+            return history[-1].outcome
+        by_mode = {
+            Mode.APPROACH: "unreachable",
+            Mode.CHECK: "missed",
+            Mode.DESCEND: "pressed",
+            Mode.RELEASE: "placed",
+        }
+        return by_mode.get(event.previous, "dropped")
 
     def _find_lifted(self, event: ModeChange) -> None:
         now = self._station.object_poses(event.root_context)

@@ -684,6 +684,29 @@ def test_the_hand_goes_down_again_if_an_object_hangs_on_it(force: float, layings
     assert run.counts == [1, 0, 0]
 
 
+def test_jaws_that_lay_an_object_down_open_fully_and_then_close_half_of_the_way():
+    run = Run(Jam(mode=Mode.RETREAT, force=(0.0, 0.0, -2.0)))
+    retreats = []
+    while len(retreats) < 3:
+        run.until(Mode.RETREAT)
+        retreats.append(run.output("desired_opening")[0])
+        run.until(Mode.RELEASE if len(retreats) < 3 else Mode.OBSERVE)
+    assert retreats[1] == pytest.approx(PARAMETERS.open_width, abs=1e-3)
+    assert retreats[2] == pytest.approx(PARAMETERS.open_width / 2, abs=1e-3)
+
+
+@pytest.mark.parametrize("press", [False, True])
+def test_the_hand_does_not_go_down_again_after_a_stop_or_a_press(press: bool):
+    pulled = Jam(mode=Mode.RETREAT, force=(0.0, 0.0, -2.0))
+    if press:
+        run = Run(pulled, answer=dataclasses.replace(ACTION, press=True)).finish()
+    else:
+        parameters = dataclasses.replace(PARAMETERS, force_limit=1.5)
+        run = Run(pulled, parameters=parameters).finish()
+        assert [item.outcome for item in run.output("history")] == ["stopped"]
+    assert run.sequence.count(Mode.LOWER) == (0 if press else 1)
+
+
 @pytest.mark.parametrize("where", [Mode.LIFT, Mode.CARRY, Mode.LOWER])
 def test_a_dropped_object_is_counted_and_retried(where: Mode):
     def width(attempt: int, mode: Mode) -> float:

@@ -205,7 +205,7 @@ class Inventory:
         here = [
             item.outcome
             for k, item in enumerate(last)
-            if k > since or self._is_there(_left_at(item), region)
+            if (k > since and item.outcome in _LOST) or self._is_there(_left_at(item), region)
         ]
         return len(here) - (here.count("set down") + 1) // 2
 
@@ -260,7 +260,9 @@ class Inventory:
         if len(moves) != 1 or not placing or placing[-1].outcome != "placed":
             return None
         last = placing[-1].action
-        if last.aside or self._is_on_fixture(last.pick) or not self._is_on_fixture(last.place):
+        if last.middle is None or last.aside:
+            return None
+        if self._is_on_fixture(last.pick) or not self._is_on_fixture(last.place):
             return None
         meant = self.observation.grid.to_pixel(_middle_left_at(placing[-1]))
         return np.asarray(region.pixels.mean(axis=0) - meant)
@@ -293,13 +295,17 @@ class Inventory:
         """Returns the earlier actions on each object that was left in a region, oldest first. The
         object that was left there last comes last.
 
-        An object that was lost on its way lies beside where it was gripped.
+        An object that was lost on its way need not lie where it was gripped. It is the nearest one,
+        unless another object lies there.
         """
         found = [moves for moves in self._moves if self._is_there(_left_at(moves[-1]), region)]
         nearest = None if found else _nearest(self._moves, self._middle(region))
-        if nearest is not None and self._moves[nearest][-1].outcome in _LOST:
-            return [self._moves[nearest]]
-        return found
+        if nearest is None or self._moves[nearest][-1].outcome not in _LOST:
+            return found
+        moves = self._moves[nearest]
+        seen = (*self.segmentation.objects, *self.segmentation.protruding)
+        is_left = any(self._is_there(_left_at(moves[-1]), it) for it in seen if it is not region)
+        return found if is_left else [moves]
 
     @cached_property
     def _moves(self) -> list[list[Attempt]]:

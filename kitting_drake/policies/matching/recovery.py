@@ -29,7 +29,7 @@ from systems.signals import Observation, PickPlaceAction, PlanarPose
 Array = NDArray[np.float64]
 
 _PRESSED = 0.012
-"""An object that protrudes by more than this, in metres, is taken out rather than pressed down."""
+"""An object that protrudes by more than this, in metres, is not pressed down."""
 _BESIDE = (0.003, 0.012)
 """An object that lies beside its place by a distance in this range, in metres, is moved there. Less
 is not why it protrudes. More is measured badly, because a part of the object is hidden."""

@@ -39,10 +39,9 @@ class ShapeMatchingPolicy:
             planner: parameters of the motion with which the hand will pick and place.
             recover: whether to prepare objects that cannot be placed yet. Protruding objects are
                 pressed down at once, and taken out if the next object needs their place. If nothing
-                fits, the policy takes heaps apart
-                (`separating_action`), then takes out objects that could not be pressed down
-                (`recovery_action`), then turns over objects that lie upside down
-                (`turning_action`).
+                fits, the policy takes heaps apart (`separating_action`), then moves or takes out
+                objects that could not be pressed down (`recovery_action`), then turns over objects
+                that lie upside down (`turning_action`).
         """
         self._planner = planner
         self._recover = recover

@@ -149,6 +149,11 @@ def test_an_object_that_is_lost_on_its_way_again_and_again_is_not_tried_forever(
     alone = scene((hammer(60, 180), 0.015))
     policy = ShapeMatchingPolicy(PLANNER)
     assert policy(dataclasses.replace(alone, history=tuple(lost))).reason == "gave up"
+    # The history of an object that still lies there is not that of its neighbour.
+    beside = scene((hammer(60, 180), 0.015), (bar(60, 240), 0.015))
+    found = Inventory.of(dataclasses.replace(beside, history=tuple(lost)))
+    tries = {int(item.mask.sum()): found.tries(item) for item in found.segmentation.objects}
+    assert tries[int(bar(60, 240).sum())] == 0
 
 
 @pytest.mark.parametrize(("gap", "is_tried"), [(2, False), (8, True)])

@@ -171,6 +171,8 @@ def test_an_object_that_lies_a_little_beside_its_place_is_moved_there_once(off: 
     lies, table = (93.5, 99.5), (60.0, 240.0)
     meant = (lies[0] - off, lies[1])
     placed = move(table, meant, aside=False)
+    middle = placed.action.pick.x, placed.action.pick.y
+    placed = dataclasses.replace(placed, action=dataclasses.replace(placed.action, middle=middle))
     seen = dataclasses.replace(observed(0.014), history=(placed,))
     action = mending(seen)
     assert action is not None
