@@ -124,6 +124,8 @@ class PickPlacePlanner(LeafSystem):
       An object that leaves the table late hangs lower than it lay, because it turned or another
       object is caught in it; it is lifted and carried higher by half as much again (`hanging`).
     - `RELEASE`: if the jaws stick to the object, they open with force.
+    - `RETREAT`: if an object still hangs on the hand as it rises, the hand brakes (`RELEASE`),
+      lowers the object (`LOWER`) and moves its jaws (`RELEASE`), twice at most in an action.
     - `SEARCH`: in tasks that insert objects into cavities, if the object stands on the rim around
       its place, the hand searches for the cavity. When the resistance ends, it lowers the object
       further.

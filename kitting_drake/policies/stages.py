@@ -306,9 +306,9 @@ class Recovery:
     """Corrects failed insertions (`recovery_action`), takes heaps apart (`separating_action`), and
     turns objects over (`turning_action`).
 
-    It presses a protruding object down at once, and takes it out if the next object needs its place
-    (`Inventory.needs_clearing`). The other corrections take several actions, so they come only when
-    no object fits into a recess.
+    It presses a protruding object down at once, and moves it or takes it out if the next object
+    needs its place (`Inventory.needs_clearing`). The other corrections take several actions, so
+    they come only when no object fits into a recess.
     """
 
     planner: PickPlaceParameters
