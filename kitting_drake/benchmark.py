@@ -201,6 +201,7 @@ def _trace(arguments: argparse.Namespace, console: Console, folder: Path) -> lis
         folder / "photos" if arguments.keep else None,
         exif=not arguments.no_exif,
         seed=arguments.seed,
+        shots=arguments.photos,
     )
     write_json(folder / "trace.json", measured)
     return [trace_table(measured)]
@@ -214,7 +215,7 @@ def _traced_kits(arguments: argparse.Namespace, console: Console, folder: Path) 
 
     with alone_in(folder):
         measured = measure_traced_kits(
-            arguments.kits, arguments.seed, arguments.fit, folder, console
+            arguments.kits, arguments.seed, arguments.fit, arguments.photos, folder, console
         )
         write_json(folder / "traced_kits.json", measured)
     return [traced_kits_table(measured)]

@@ -27,7 +27,12 @@ this, almost everywhere. `hkd kit` adds this distance to small clearances.
 def describe_trace(tracer: argparse.ArgumentParser) -> None:
     """Adds the arguments of `hkd trace`."""
     tracer.add_argument(
-        "photo", type=Path, metavar="PHOTO", help="a photo of the tools from above (JPEG, PNG)"
+        "photos",
+        type=Path,
+        nargs="+",
+        metavar="PHOTO",
+        help="a photo of the tools from above (JPEG, PNG); better two photos, from opposite sides "
+        "of the sheet",
     )
     tracer.add_argument(
         "--output", type=Path, required=True, metavar="DIR", help="the folder to write"
@@ -45,7 +50,7 @@ def describe_trace(tracer: argparse.ArgumentParser) -> None:
         nargs="+",
         metavar="MM",
         help="height of the tools above the ground, in mm: one for all, or one for each from "
-        "left to right",
+        "left to right (default: found from several photos)",
     )
     tracer.add_argument(
         "--edges",
@@ -66,7 +71,7 @@ def describe_trace(tracer: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="a file of corrections (YAML): see docs/printing.md",
     )
-    tracer.add_argument("--name", help="name of the outlines (default: the photo's name)")
+    tracer.add_argument("--name", help="name of the outlines (default: the first photo's name)")
     tracer.add_argument(
         "--category",
         nargs="+",
@@ -121,14 +126,14 @@ def _print_tool(console: Console, tool: "TracedTool") -> None:
     places = ", ".join(f"({x:.0f}, {y:.0f})" for x, y in (item.place for item in tool.doubts))
     console.print(
         f"  DOUBT: its outline may be wrong near {places} mm, where tool, shine and shadow look "
-        "alike: see the red circles in trace.png, and mend it with --points or take the photo in "
-        "softer light",
+        "alike: see the red circles in trace.png, and mend it with --points, add a photo from "
+        "another side, or take the photo in softer light",
         soft_wrap=True,
     )
 
 
 def trace_photo(args: argparse.Namespace) -> None:
-    """Traces a photo and prints what was found; imports the tools on request.
+    """Traces photos and prints what was found; imports the tools on request.
 
     Raises:
         UserError: the arguments or the photo cannot be used.
@@ -136,10 +141,10 @@ def trace_photo(args: argparse.Namespace) -> None:
     # Import lazily, because OpenCV is slow to import.
     from kitting_drake.hkd.tracing.tracer import TraceRequest, trace
 
-    if args.category and not args.height_mm:
-        raise UserError("--category needs the tools' height: give --height_mm")
+    if args.category and not args.height_mm and len(args.photos) == 1:
+        raise UserError("--category needs the tools' height: give --height_mm or a second photo")
     request = TraceRequest(
-        photo=args.photo,
+        photos=tuple(args.photos),
         output=args.output,
         sheet_mm=_sheet(args.sheet),
         scale=_scale(args),
@@ -150,7 +155,7 @@ def trace_photo(args: argparse.Namespace) -> None:
         name=args.name,
     )
     console = Console(quiet=args.quiet, highlight=False, markup=False)
-    with Console(stderr=True, quiet=args.quiet).status(f"tracing {escape(str(args.photo))}"):
+    with Console(stderr=True, quiet=args.quiet).status(f"tracing {escape(str(args.photos[0]))}"):
         report = trace(request)
     for tool in report.tools:
         _print_tool(console, tool)

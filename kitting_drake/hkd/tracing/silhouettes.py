@@ -1,5 +1,6 @@
 """Finds the silhouettes of tools on a rectified photo, in mm."""
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -32,10 +33,30 @@ _STRETCH_GAP_MM = 2.0
 class Unclear:
     """A region that may be tool, or may be ground or shadow."""
 
-    place: tuple[float, float]
-    """The centroid (x, y) of the region, in mm."""
+    region: CrossSection
+    """The region, in mm."""
     area: float
-    """The area of the region, in mm^2."""
+    """The area of the region in which the border may lie, in mm^2."""
+
+    @property
+    def place(self) -> tuple[float, float]:
+        """The middle (x, y) of the region, in mm."""
+        x_low, y_low, x_high, y_high = self.region.bounds()
+        return (x_low + x_high) / 2, (y_low + y_high) / 2
+
+
+@dataclass(frozen=True)
+class Silhouettes:
+    """What `find_silhouettes` finds in a photo."""
+
+    area: CrossSection
+    """The region that tools cover, in mm."""
+    blur_mm: float
+    """The width of the blur of its border, in mm."""
+    unclear: tuple[Unclear, ...]
+    """The unclear regions, the largest first."""
+    lightness: Array
+    """(rows, columns) the logarithm of each pixel's light, relative to the lit ground."""
 
 
 def find_silhouettes(
@@ -44,7 +65,7 @@ def find_silhouettes(
     sheet: Array | None,
     hidden: tuple[Array, ...],
     height: float | None = None,
-) -> tuple[CrossSection, float, list[Unclear]]:
+) -> Silhouettes:
     """Finds the region that tools cover.
 
     Args:
@@ -54,10 +75,6 @@ def find_silhouettes(
             the origin. None: there is no sheet, and tools may lie anywhere in the photo.
         hidden: polygons (n, 2) in mm in which no tools are sought.
         height: the height of the lowest tool, in mm; None: unknown.
-
-    Returns:
-        The region, in mm; the width of the blur of its border, in mm; and the unclear regions, the
-        largest first.
 
     Raises:
         UserError: a tool extends beyond the sheet's edge.
@@ -79,43 +96,57 @@ def find_silhouettes(
                 "a tool reaches over the sheet's edge: move it onto the sheet, or use a larger "
                 "sheet (--sheet LENGTH WIDTH)"
             )
+    lightness = ratio.mean(axis=2)
     if not mask.any():
-        return CrossSection(), 0.0, []
+        return Silhouettes(CrossSection(), 0.0, (), lightness)
     soft = soft_mask(cv2, photo, mask)
     area = _cleaned(contours(photo, soft))
     differ = (mask ^ masks.mask(BOLD)) | masks.shine(mask)
     unclear = [*_unclear(cv2, photo, differ), *_blended(cv2, photo, masks.blended(mask))]
     unclear.sort(key=lambda item: -item.area)
-    return area, _blur_mm(cv2, soft, mask, ppm), unclear
+    return Silhouettes(area, _blur_mm(cv2, soft, mask, ppm), tuple(unclear), lightness)
 
 
 def _unclear(cv2: Any, photo: RectifiedPhoto, differ: Array) -> list[Unclear]:
     """Returns the regions of a mask (rows, columns) that are wider than twice `_EDGE_SLACK_MM`."""
-    ppm = photo.px_per_mm
-    radius = max(1, round(_EDGE_SLACK_MM * ppm))
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+    disc = _disc(cv2, _EDGE_SLACK_MM * photo.px_per_mm)
     differ = cv2.morphologyEx(differ, cv2.MORPH_OPEN, disc)
-    _, _, stats, centres = cv2.connectedComponentsWithStats(differ, connectivity=8)
-    areas = stats[1:, cv2.CC_STAT_AREA] / ppm**2
-    return _unclear_at(photo, centres[1:], areas)
+    return [Unclear(region, region.area()) for region in _regions(photo, differ)]
 
 
 def _blended(cv2: Any, photo: RectifiedPhoto, border: Array) -> list[Unclear]:
     """Returns the stretches of unclear border in a mask (rows, columns)."""
-    ppm = photo.px_per_mm
-    radius = max(1, round(_STRETCH_GAP_MM / 2 * ppm))
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
-    _, labels, stats, centres = cv2.connectedComponentsWithStats(cv2.dilate(border, disc))
-    lengths = np.bincount(labels[border > 0], minlength=len(stats))[1:] / ppm
-    return _unclear_at(photo, centres[1:], _BORDER_SLACK_MM * lengths)
-
-
-def _unclear_at(photo: RectifiedPhoto, pixels: Array, areas: Array) -> list[Unclear]:
-    places = photo.to_mm(pixels) if len(areas) else pixels
+    disc = _disc(cv2, _STRETCH_GAP_MM / 2 * photo.px_per_mm)
+    _, labels = cv2.connectedComponents(cv2.dilate(border, disc))
+    lengths = np.bincount(labels[border > 0], minlength=1) / photo.px_per_mm
     return [
-        Unclear((float(x), float(y)), float(area))
-        for (x, y), area in zip(places, areas, strict=True)
+        Unclear(region, _BORDER_SLACK_MM * float(length))
+        for label, length in enumerate(lengths)
+        if label and length
+        for region in _regions(photo, labels == label)[:1]
     ]
+
+
+def _regions(photo: RectifiedPhoto, mask: Array) -> list[CrossSection]:
+    """Returns the connected regions of a mask (rows, columns), in mm, the largest first."""
+    parts = contours(photo, mask.astype(np.float32)).decompose()
+    return sorted(parts, key=lambda part: -part.area())
+
+
+def _disc(cv2: Any, radius: float) -> Array:
+    n = max(1, round(radius))
+    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * n + 1, 2 * n + 1))
+
+
+def lightness_in(cv2: Any, photo: RectifiedPhoto, lightness: Array, region: CrossSection) -> float:
+    """Returns the median of `Silhouettes.lightness` in a region in mm; NaN off the photo."""
+    mask = np.zeros(photo.shape, np.uint8)
+    loops = [
+        np.round(photo.to_px(np.asarray(loop))).astype(np.int32) for loop in region.to_polygons()
+    ]
+    cv2.fillPoly(mask, loops, 1)
+    inside = lightness[(mask > 0) & photo.seen]
+    return float(np.median(inside)) if inside.size else math.nan
 
 
 def _rectangle(low: Array | float, high: Array) -> Array:

@@ -1,20 +1,21 @@
-"""Traces the outlines of tools in a photo, as drawings in mm and as tools (`hkd trace`).
+"""Traces the outlines of tools in photos, as drawings in mm and as tools (`hkd trace`).
 
 1. An object of known size gives the plane that the tools lie on (`sheet_plane`, `scales`).
 2. The photo is rectified (`plane_view`).
 3. Tools are separated from the ground and from shadows (`tool_mask`).
 4. Their border is found to a fraction of a pixel (`silhouettes`).
-5. The silhouette is corrected for the tool's height (`tool_height`).
+5. The silhouettes of one or several photos are corrected for the tool's height (`views`).
 """
 
 import math
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from manifold3d import CrossSection, JoinType
+from manifold3d import CrossSection
+from numpy.typing import NDArray
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.extras import import_extra
@@ -25,8 +26,14 @@ from kitting_drake.hkd.tracing.plane_view import RectifiedPhoto, rectify
 from kitting_drake.hkd.tracing.scales import Scale, plane_of_scale
 from kitting_drake.hkd.tracing.sheet_plane import GroundPlane, plane_of_sheet
 from kitting_drake.hkd.tracing.silhouettes import Unclear, find_silhouettes
-from kitting_drake.hkd.tracing.tool_height import outline_of_silhouette
 from kitting_drake.hkd.tracing.trace_files import outlines_dxf, outlines_svg, trace_png
+from kitting_drake.hkd.tracing.views import (
+    View,
+    aligned,
+    doubts_of,
+    height_in_views,
+    outline_in_views,
+)
 
 _STEEPEST = math.radians(30)
 """The largest accepted angle between the camera's optical axis and the vertical, in radians."""
@@ -36,28 +43,24 @@ _BLURRED_MM = 1.6
 """The width of the edges' blur, in mm, above which a photo counts as blurred."""
 _HEIGHTS_MM = (0.5, 100.0)
 _CAMERAS_MM = (100.0, 3000.0)
-_SHARE_OF_HEIGHT = 0.5
-"""A tool may be at most this high, as a share of the camera's height."""
-_DOUBTED_MM = 0.12
-"""An outline is in doubt if the area of its unclear regions, divided by its perimeter, exceeds
-this, in mm."""
-_MOST_DOUBTS = 4
-_APART_MM = 15.0
-"""Silhouettes closer than this, in mm, may belong to one tool."""
+_MOST_PHOTOS = 6
 
 
 @dataclass(frozen=True)
 class TraceRequest:
-    """A photo to trace, and how to read it."""
+    """Photos to trace, and how to read them."""
 
-    photo: Path
+    photos: tuple[Path, ...]
+    """Photos of the same tools on the same sheet, from different sides. The first one defines the
+    frame of all outlines."""
     output: Path
     sheet_mm: tuple[float, float] | None = None
     """The sheet's sides. None: A4 or Letter, whichever the sheet looks like."""
     scale: Scale | None = None
     """An object of known size that is used instead of a sheet."""
     heights_mm: tuple[float, ...] = ()
-    """The tools' heights, from left to right, or one height for all tools. Empty: no correction."""
+    """The tools' heights, from left to right, or one height for all tools. Empty: no correction if
+    there is one photo; else the heights are found from the photos."""
     edges: str = "upright"
     """One of `tool_height.EDGES`."""
     camera_mm: float | None = None
@@ -65,7 +68,7 @@ class TraceRequest:
     points: Path | None = None
     """A file of corrections; see `corrections`."""
     name: str | None = None
-    """The name of the outlines. None: the photo's name."""
+    """The name of the outlines. None: the first photo's name."""
 
 
 @dataclass(frozen=True)
@@ -100,57 +103,66 @@ class TracedTool:
 
 @dataclass(frozen=True)
 class TraceReport:
-    """The outlines traced in a photo, and notes for the user."""
+    """The outlines traced in photos, and notes for the user."""
 
     tools: list[TracedTool]
     notes: list[str]
 
 
 def trace(request: TraceRequest) -> TraceReport:
-    """Traces the tools of a photo and writes their outlines and a picture.
+    """Traces the tools of photos and writes their outlines and a picture.
 
     Raises:
-        UserError: the request is not valid, or the photo cannot be traced reliably. Nothing is
+        UserError: the request is not valid, or the photos cannot be traced reliably. Nothing is
             written then.
         MachineError: OpenCV or ezdxf is missing.
     """
     cv2 = import_extra("cv2", purpose="hkd trace", extra="camera")
     name = _checked(request)
     corrections = read_corrections(request.points) if request.points else Corrections()
-    photo = read_photo(request.photo)
-    plane = (
-        plane_of_scale(cv2, photo, request.scale, request.camera_mm)
-        if request.scale
-        else plane_of_sheet(cv2, photo, request.sheet_mm, corrections.corners, request.camera_mm)
-    )
-    _check_view(photo, plane)
-    seen, silhouette, blur, unclear = _look(cv2, photo, plane, request.heights_mm)
-    silhouette = corrections.applied(silhouette)
-    parts = [part for part in silhouette.decompose() if part.area() > 0]
+    corners = (corrections.corners, *[None] * (len(request.photos) - 1))
+    views = [
+        _look(cv2, request, path, sheet)
+        for path, sheet in zip(request.photos, corners, strict=True)
+    ]
+    views = [views[0], *(aligned(view, views[0]) for view in views[1:])]
+    views = [replace(view, silhouette=corrections.applied(view.silhouette)) for view in views]
+    parts = [part for part in views[0].silhouette.decompose() if part.area() > 0]
+    if not parts:
+        raise UserError(
+            f"{request.photos[0]}: no tool is seen: use a ground of another colour, or add the "
+            "tool with --points"
+        )
     parts.sort(key=lambda part: part.bounds()[0])
-    _check_parts(photo, parts, seen, max(blur, plane.blur_mm))
-    heights = _heights(request, len(parts))
+    heights = _heights(request, parts, views)
+    outlines = [
+        part if height is None else outline_in_views(part, views, height, request.edges)
+        for part, height in zip(parts, heights, strict=True)
+    ]
     names = [name] if len(parts) == 1 else [f"{name}_{i + 1}" for i in range(len(parts))]
-    tools = []
-    doubts = _doubts(parts, unclear, corrections)
-    for part, height, own, doubtful in zip(parts, heights, names, doubts, strict=True):
-        outline = part
-        if height is not None:
-            outline = _corrected(photo, part, plane, height, request.edges)
-        svg = request.output / f"{own}.svg"
-        tools.append(TracedTool(own, outline, height, svg, doubtful))
-    notes = [*plane.notes, *_view_notes(plane, request, len(parts))]
-    _write(cv2, request, tools, notes, seen, silhouette, plane)
+    doubts = doubts_of(parts, outlines, heights, views, request.edges, corrections)
+    tools = [
+        TracedTool(own, outline, height, request.output / f"{own}.svg", doubtful)
+        for own, outline, height, doubtful in zip(names, outlines, heights, doubts, strict=True)
+    ]
+    notes = [*views[0].plane.notes, *_view_notes(views, request, tools)]
+    _write(cv2, request, tools, notes, views[0])
     return TraceReport(tools, notes)
 
 
 def _checked(request: TraceRequest) -> str:
-    name = request.name or re.sub(r"[^a-z0-9]+", "_", request.photo.stem.lower()).strip("_")[:50]
+    name = (
+        request.name or re.sub(r"[^a-z0-9]+", "_", request.photos[0].stem.lower()).strip("_")[:50]
+    )
     if not re.fullmatch(r"[a-z0-9][a-z0-9_]{0,60}", name):
         raise UserError(
             f"the name '{name}' is not valid: give a --name of at most 61 lower-case letters, "
             "digits and underscores, beginning with a letter or digit"
         )
+    if len(request.photos) > 1 and request.scale is not None:
+        raise UserError("several photos need a sheet of paper below the tools, not another scale")
+    if len(request.photos) > _MOST_PHOTOS:
+        raise UserError(f"{len(request.photos)} photos are too many: give up to {_MOST_PHOTOS}")
     for flag, values, (low, high) in (
         ("--height_mm", request.heights_mm, _HEIGHTS_MM),
         ("--camera_mm", (request.camera_mm,) if request.camera_mm else (), _CAMERAS_MM),
@@ -172,17 +184,29 @@ def _check_view(photo: Photo, plane: GroundPlane) -> None:
 
 
 def _look(
-    cv2: Any, photo: Photo, plane: GroundPlane, heights: tuple[float, ...]
-) -> tuple[RectifiedPhoto, CrossSection, float, list[Unclear]]:
-    """Returns the photo as seen from above, and the results of `find_silhouettes`."""
+    cv2: Any, request: TraceRequest, path: Path, corners: NDArray[np.float64] | None = None
+) -> View:
+    """Finds the silhouettes of the tools in one photo, in the frame of its own plane.
+
+    Raises:
+        UserError: the photo cannot be traced reliably.
+    """
+    photo = read_photo(path)
+    plane = (
+        plane_of_scale(cv2, photo, request.scale, request.camera_mm)
+        if request.scale
+        else plane_of_sheet(cv2, photo, request.sheet_mm, corners, request.camera_mm)
+    )
+    _check_view(photo, plane)
     seen = _rectified(cv2, plane)
+    lowest = min(request.heights_mm, default=None)
     try:
-        return (
-            seen,
-            *find_silhouettes(cv2, seen, plane.sheet, plane.hidden, min(heights, default=None)),
-        )
+        found = find_silhouettes(cv2, seen, plane.sheet, plane.hidden, lowest)
     except UserError as error:
         raise UserError(f"{photo.path}: {error}") from error
+    view = View(photo, plane, seen, found.lightness, found.area, found.unclear, plane.view.camera)
+    _check_silhouette(view, max(found.blur_mm, plane.blur_mm))
+    return view
 
 
 def _rectified(cv2: Any, plane: GroundPlane) -> RectifiedPhoto:
@@ -197,132 +221,62 @@ def _rectified(cv2: Any, plane: GroundPlane) -> RectifiedPhoto:
     return rectify(cv2, plane.pixels, plane.view, low, high, px_per_mm)
 
 
-def _check_parts(
-    photo: Photo, parts: list[CrossSection], seen: RectifiedPhoto, blur: float
-) -> None:
-    if not parts:
-        raise UserError(
-            f"{photo.path}: no tool is seen: use a ground of another colour, or add the tool "
-            "with --points"
-        )
+def _check_silhouette(view: View, blur: float) -> None:
+    """Raises a UserError if a photo is blurred or does not show a whole tool."""
+    path, seen = view.photo.path, view.seen
     if blur > _BLURRED_MM:
         raise UserError(
-            f"{photo.path} is blurred: edges are {blur:.1f} mm wide; take it again, with more "
-            "light or a steadier hand"
+            f"{path} is blurred: edges are {blur:.1f} mm wide; take it again, with more light or a "
+            "steadier hand"
         )
-    for part in parts:
-        for loop in part.to_polygons():
-            u, v = np.round(seen.to_px(np.asarray(loop))).astype(int).T
-            rows, columns = seen.shape
-            u, v = np.clip(u, 2, columns - 3), np.clip(v, 2, rows - 3)
-            if not all(seen.seen[v + dv, u + du].all() for du in (-2, 2) for dv in (-2, 2)):
-                raise UserError(
-                    f"{photo.path}: a tool touches the photo's edge: show the whole tool, and "
-                    "some ground around it"
-                )
+    for loop in view.silhouette.to_polygons():
+        u, v = np.round(seen.to_px(np.asarray(loop))).astype(int).T
+        rows, columns = seen.shape
+        u, v = np.clip(u, 2, columns - 3), np.clip(v, 2, rows - 3)
+        if not all(seen.seen[v + dv, u + du].all() for du in (-2, 2) for dv in (-2, 2)):
+            raise UserError(
+                f"{path}: a tool touches the photo's edge: show the whole tool, and some ground "
+                "around it"
+            )
 
 
-def _doubts(
-    parts: list[CrossSection], unclear: list[Unclear], corrections: Corrections
-) -> list[tuple[Unclear, ...]]:
-    """Returns, for each silhouette, the places where it may be wrong.
-
-    First come narrow gaps to other silhouettes, then unclear regions, the largest first. Places
-    that the user has corrected are left out.
-    """
-    near: list[list[Unclear]] = [[] for _ in parts]
-    for item in unclear:
-        if corrections.settles(item.place):
-            continue
-        square = CrossSection.square((1.0, 1.0), True).translate(item.place)
-        away = [
-            CrossSection.batch_hull([part.hull(), square]).area() - part.hull().area()
-            for part in parts
-        ]
-        near[int(np.argmin(away))].append(item)
-    result = []
-    for i, (part, items) in enumerate(zip(parts, near, strict=True)):
-        matters = sum(item.area for item in items) > _DOUBTED_MM * _perimeter(part)
-        gaps = [_gap_between(part, other) for j, other in enumerate(parts) if j != i]
-        split = [gap for gap in gaps if gap is not None and not corrections.settles(gap.place)]
-        result.append(tuple([*split, *(items if matters else [])][:_MOST_DOUBTS]))
-    return result
-
-
-def _gap_between(part: CrossSection, other: CrossSection) -> Unclear | None:
-    """Returns the gap between two close silhouettes; a reflection may have split one tool into two.
-
-    Returns None if they are more than `_APART_MM` apart.
-    """
-    grown = _APART_MM / 2
-    bridge = part.offset(grown, JoinType.Round) ^ other.offset(grown, JoinType.Round)
-    if bridge.is_empty():
-        return None
-    x_low, y_low, x_high, y_high = bridge.bounds()
-    return Unclear(((x_low + x_high) / 2, (y_low + y_high) / 2), bridge.area())
-
-
-def _perimeter(area: CrossSection) -> float:
-    loops = [np.asarray(loop) for loop in area.to_polygons()]
-    return sum(
-        float(np.linalg.norm(loop - np.roll(loop, 1, axis=0), axis=1).sum()) for loop in loops
-    )
-
-
-def _heights(request: TraceRequest, count: int) -> list[float | None]:
+def _heights(
+    request: TraceRequest, parts: list[CrossSection], views: list[View]
+) -> list[float | None]:
     given = request.heights_mm
     if not given:
-        return [None] * count
+        if len(views) == 1:
+            return [None] * len(parts)
+        return [height_in_views(part, views, request.edges) for part in parts]
     if len(given) == 1:
-        return [given[0]] * count
-    if len(given) != count:
+        return [given[0]] * len(parts)
+    if len(given) != len(parts):
         raise UserError(
-            f"--height_mm has {len(given)} heights, and {request.photo} shows {count} tools: give "
-            "one height for each tool, from left to right, or one for all"
+            f"--height_mm has {len(given)} heights, and {request.photos[0]} shows {len(parts)} "
+            "tools: give one height for each tool, from left to right, or one for all"
         )
     return [*given]
 
 
-def _corrected(
-    photo: Photo, part: CrossSection, plane: GroundPlane, height: float, edges: str
-) -> CrossSection:
-    camera = plane.view.camera
-    if height > _SHARE_OF_HEIGHT * camera[2]:
-        raise UserError(
-            f"{photo.path}: the camera is only {camera[2]:.0f} mm above the ground, which is too "
-            f"close for a tool {height:g} mm high: take the photo from farther away"
-        )
-    outline = outline_of_silhouette(part, camera, height, edges)
-    parts = sorted(outline.decompose(), key=lambda piece: -piece.area())
-    if not parts or parts[0].area() < 0.5 * part.area():
-        raise UserError(
-            f"{photo.path}: the correction for a tool {height:g} mm high leaves less than half of "
-            "its silhouette: give its true height, or take the photo from straight above"
-        )
-    return parts[0]
-
-
-def _view_notes(plane: GroundPlane, request: TraceRequest, count: int) -> list[str]:
-    view = plane.view
-    where = (
+def _view_notes(views: list[View], request: TraceRequest, tools: list[TracedTool]) -> list[str]:
+    where = "; ".join(
         f"the camera is {view.camera[2]:.0f} mm above the ground, tilted by "
-        f"{math.degrees(view.tilt):.0f} degrees"
+        f"{math.degrees(view.plane.view.tilt):.0f} degrees"
+        for view in views
     )
+    if len(tools) > 1:
+        where += f"; {len(tools)} tools (a reflection across a tool may have split it)"
+    if len(views) == 1 and not request.heights_mm:
+        return [where, "not corrected for the tools' height: give --height_mm or a second photo"]
+    corrected = f"corrected for the height of the tools, whose sides are {request.edges}"
     if not request.heights_mm:
-        return [where, "not corrected for the tools' height: give --height_mm"]
-    if count > 1:
-        where += f"; {count} tools (a reflection across a tool may have split it)"
-    return [where, f"corrected for the height of the tools, whose sides are {request.edges}"]
+        found = ", ".join(f"{tool.height_mm:g}" for tool in tools)
+        corrected += f": {found} mm, as the photos show it"
+    return [where, corrected]
 
 
 def _write(
-    cv2: Any,
-    request: TraceRequest,
-    tools: list[TracedTool],
-    notes: list[str],
-    seen: RectifiedPhoto,
-    silhouette: CrossSection,
-    plane: GroundPlane,
+    cv2: Any, request: TraceRequest, tools: list[TracedTool], notes: list[str], view: View
 ) -> None:
     outlines = {tool.name: tool.outline for tool in tools}
     files: dict[str, str | bytes] = {}
@@ -336,23 +290,22 @@ def _write(
         )
     files["trace.png"] = trace_png(
         cv2,
-        seen,
-        silhouette,
+        view.seen,
+        view.silhouette,
         outlines,
         [item.place for tool in tools for item in tool.doubts],
-        request.photo.name,
+        view.photo.path.name,
     )
     folder = require_folder(request.output)
     for file, content in files.items():
         write_atomically(folder / file, content)
-    view = plane.view
     write_json(
         folder / "trace.json",
         {
-            "photo": str(request.photo),
+            "photos": [str(path) for path in request.photos],
             "notes": notes,
             "camera_mm": np.round(view.camera, 2).tolist(),
-            "tilt_deg": round(math.degrees(view.tilt), 2),
+            "tilt_deg": round(math.degrees(view.plane.view.tilt), 2),
             "edges": request.edges,
             "corrections": str(request.points) if request.points else None,
             "tools": [

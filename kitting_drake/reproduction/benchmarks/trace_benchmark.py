@@ -53,8 +53,9 @@ def benchmark_trace(
     folder: Path | None = None,
     exif: bool = True,
     seed: int = 0,
+    shots: int = 1,
 ) -> dict[str, Any]:
-    """Renders three photos of each tool, traces them and measures the outlines, in mm.
+    """Renders three scenes of each tool, traces them and measures the outlines, in mm.
 
     A separate summary covers only the outlines about which the tracer reports no doubts. All errors
     are measured twice: as traced, and with gaps narrower than `GAP_MM` closed. Such gaps hardly
@@ -66,6 +67,7 @@ def benchmark_trace(
         folder: the folder in which to keep photos and pictures; None keeps none.
         exif: whether the photos state their focal length.
         seed: the seed of the photos.
+        shots: the number of photos of each scene, from different sides.
     """
     photos: list[dict[str, Any]] = []
     pooled: list[tuple[bool, Points, Points]] = []
@@ -77,8 +79,7 @@ def benchmark_trace(
         with tempfile.TemporaryDirectory() as scratch:
             kept = folder / f"{name}_{k}" if folder else Path(scratch)
             kept.mkdir(parents=True, exist_ok=True)
-            path = kept / "photo.jpg"
-            path.write_bytes(draw_photo([tool], spec))
+            paths = write_photos(kept, spec, tool, shots)
             entry: dict[str, Any] = {
                 "tool": name,
                 "height_mm": tool.height,
@@ -87,7 +88,7 @@ def benchmark_trace(
             }
             start, worked = time.perf_counter(), time.process_time()
             try:
-                report = trace(TraceRequest(path, kept, heights_mm=(tool.height,), name="traced"))
+                report = trace(TraceRequest(paths, kept, heights_mm=(tool.height,), name="traced"))
                 entry["tools"] = len(report.tools)
                 traced = max(report.tools, key=lambda t: t.outline.area())
                 outline = traced.outline
@@ -103,7 +104,15 @@ def benchmark_trace(
             entry["seconds"] = time.perf_counter() - start
             entry["processor_seconds"] = time.process_time() - worked
         photos.append(entry)
-    return {"photos": photos, **_summary(photos, pooled)}
+    return {"shots": shots, "photos": photos, **_summary(photos, pooled)}
+
+
+def write_photos(folder: Path, spec: PhotoSpec, tool: PlacedTool, shots: int) -> tuple[Path, ...]:
+    """Renders photos of a tool from up to four sides into a folder."""
+    paths = tuple(folder / f"photo_{shot}.jpg" for shot in range(shots))
+    for shot, path in enumerate(paths):
+        path.write_bytes(draw_photo([tool], spec.from_side(shot)))
+    return paths
 
 
 def drawn_case(
@@ -254,7 +263,9 @@ def _pooled(errors: list[tuple[Points, Points]]) -> dict[str, float] | None:
 def trace_table(measured: dict[str, Any]) -> Table:
     """Makes a table of the measurements."""
     photos = measured["photos"]
-    table = numbers_table(f"{len(photos)} photos of 12 megapixels", "what", "measured")
+    shots = "1 photo" if measured["shots"] == 1 else f"{measured['shots']} photos"
+    title = f"{len(photos)} scenes, each with {shots} of 12 megapixels"
+    table = numbers_table(title, "what", "measured")
     table.add_row("traced, refused", f"{measured['traced']}, {len(photos) - measured['traced']}")
     if not measured["traced"]:
         return table
@@ -267,7 +278,7 @@ def trace_table(measured: dict[str, Any]) -> Table:
                 f"{errors['gapless_p95_mm']:.2f}",
             )
     within = f"{measured['median_within']}, {measured['p95_within']}"
-    table.add_row("photos with a median of 0.5 mm, a p95 of 1 mm", within)
+    table.add_row("scenes with a median of 0.5 mm, a p95 of 1 mm", within)
     table.add_row("length, mm: p95 of the error", f"{measured['length_mm']:.2f}")
     times = f"{measured['seconds']:.1f}, {measured['slowest_s']:.1f}"
     table.add_row("time, s: median, slowest", times)

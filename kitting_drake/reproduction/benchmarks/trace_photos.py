@@ -10,7 +10,7 @@ camera.
 import io
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -78,6 +78,15 @@ class PhotoSpec:
     exif: bool = True
     """Whether the photo states its focal length in its EXIF data."""
     seed: int = 0
+    """The seed of textures and noise."""
+    shot: int = 0
+    """The number of the photo among several photos of the same scene, which differ in noise."""
+
+    def from_side(self, shot: int) -> "PhotoSpec":
+        """The conditions of photo number `shot` of the same scene. Photo 1 is taken from the
+        opposite side of the sheet, photos 2 and 3 from the sides between."""
+        turn = (0, 180, 90, 270)[shot]
+        return replace(self, azimuth=self.azimuth + turn, roll=self.roll + turn, shot=shot)
 
 
 @dataclass(frozen=True)
@@ -139,7 +148,8 @@ def draw_photo(
     picture = cv2.GaussianBlur(picture, (0, 0), spec.blur)
     coded = _srgb(picture)
     # Draw noise for small tiles, which is faster than for all pixels and looks the same.
-    noise = rng.normal(0, spec.noise, (701, 997, 3)).astype(np.float32)
+    noise_rng = np.random.default_rng([spec.seed, spec.shot]) if spec.shot else rng
+    noise = noise_rng.normal(0, spec.noise, (701, 997, 3)).astype(np.float32)
     rows = -(-coded.shape[0] // 701)
     columns = -(-coded.shape[1] // 997)
     coded += np.tile(noise, (rows, columns, 1))[: coded.shape[0], : coded.shape[1]]
@@ -291,7 +301,7 @@ def _paint_tool(
         cv2.fillPoly(canvas, [_fine(quad - low)], (*colour, 255), 8, 4)
     cover = np.zeros(canvas.shape[:2], np.uint8)
     cv2.fillPoly(cover, [_fine(p - low) for p in tops], 255, 8, 4)
-    skin = _skin(cv2, tool, paints, rng, middle)
+    skin = _skin(cv2, tool, paints, rng, middle, spec)
     shift = np.array([[2, 0, 0.5 - 2 * low[0]], [0, 2, 0.5 - 2 * low[1]], [0, 0, 1.0]])
     to_plane = np.array([[0.5, 0, x_low - 5], [0, 0.5, tool.outline.bounds()[1] - 5], [0, 0, 1.0]])
     warped = cv2.warpPerspective(
@@ -308,7 +318,12 @@ def _paint_tool(
 
 
 def _skin(
-    cv2: Any, tool: PlacedTool, paints: Array, rng: np.random.Generator, middle: float
+    cv2: Any,
+    tool: PlacedTool,
+    paints: Array,
+    rng: np.random.Generator,
+    middle: float,
+    spec: PhotoSpec,
 ) -> Array:
     """Draws the colours of a tool's top, as square roots of linear values, at 2 pixels per mm."""
     x_low, y_low, x_high, y_high = tool.outline.bounds()
@@ -319,7 +334,9 @@ def _skin(
         rng.normal(0, 1, (height, width)).astype(np.float32), (0, 0), 12, None, 0.7
     )
     colour *= np.clip(1 + 0.25 * streaks / streaks.std(), 0.2, 2)[..., None]
-    # Draw a few bright bands, in which metal mirrors a lamp.
+    # Draw a few bright bands, in which metal mirrors a lamp. They move with the camera.
+    if spec.shot:
+        rng = np.random.default_rng([spec.seed, spec.shot, 1])
     for _ in range(2):
         where, wide = rng.uniform(x_low, x_high), rng.uniform(2, 6)
         shine = rng.uniform(0.2, 1.0) * np.exp(-(((along - where) / wide) ** 2))

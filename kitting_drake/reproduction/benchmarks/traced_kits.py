@@ -23,54 +23,57 @@ from kitting_drake.hkd.fabrication.kit_request import FITS, KitRequest
 from kitting_drake.hkd.tools.tool import load_tool
 from kitting_drake.hkd.tracing.command import import_traced
 from kitting_drake.hkd.tracing.tracer import TraceRequest, trace
-from kitting_drake.reproduction.benchmarks.trace_benchmark import TOOLS, drawn_case
-from kitting_drake.reproduction.benchmarks.trace_photos import draw_photo
+from kitting_drake.reproduction.benchmarks.trace_benchmark import TOOLS, drawn_case, write_photos
 from kitting_drake.scenario.choosing import find_scenario
 
 _PHOTOS = 6
-"""The largest number of photos of a tool. Another photo is taken if the tracer refuses a photo or
-doubts its outline."""
+"""The largest number of scenes of a tool. Another scene is photographed if the tracer refuses the
+photos or doubts the outline."""
 _TOOLS = 4
 _LINES = "kits.jsonl"
 
 
 def measure_traced_kits(
-    kits: int, seed: int, fit: str, folder: Path, console: Console
+    kits: int, seed: int, fit: str, shots: int, folder: Path, console: Console
 ) -> dict[str, Any]:
     """Makes kits of four tools from traced photos, and lets the oracle fill them with the true
     tools, with one try for each tool. Skips the kits that are in the folder already.
 
-    The photos are rendered as for `benchmark trace`, with each tool's own height. If the tracer
-    refuses a photo or doubts its outline, another photo is taken, as `hkd trace` asks.
+    The photos are rendered as for `benchmark trace`, with each tool's own height. With one photo of
+    a scene, the tracer is given this height, else it finds it. If the tracer refuses the photos or
+    doubts the outline, photos of another scene are taken.
 
     Args:
         kits: the number of kits.
         seed: the seed of photos and scenes.
         fit: the kits' clearance, a key of `FITS`.
+        shots: the number of photos of each scene, from different sides.
         folder: the folder of `kits.jsonl`, photos and kits.
         console: the console for the progress.
 
     Raises:
         UserError: the folder holds other files, or the kits of another version.
     """
-    identity = {"seed": seed, "fit": fit, "versions": versions()}
-    claim_folder(folder, "kits_of.json", identity, of="seed, fit or version")
+    identity = {"seed": seed, "fit": fit, "shots": shots, "versions": versions()}
+    claim_folder(folder, "kits_of.json", identity, of="seed, fit, number of photos or version")
     done = {line["kit"]: line for line in read_lines(folder / _LINES)}
     with counting_bar(console, "kits") as progress:
         bar = progress.add_task("", total=kits)
         for number in range(kits):
             if number not in done:
-                done[number] = _measure(number, seed, FITS[fit], folder / f"kit_{number}")
+                done[number] = _measure(number, seed, FITS[fit], shots, folder / f"kit_{number}")
                 append_line(folder / _LINES, done[number])
             progress.advance(bar)
     return {**identity, "commit": commit(), **_summary([done[number] for number in range(kits)])}
 
 
-def _measure(number: int, seed: int, clearance_mm: float, folder: Path) -> dict[str, Any]:
+def _measure(
+    number: int, seed: int, clearance_mm: float, shots: int, folder: Path
+) -> dict[str, Any]:
     """Makes one kit and fills it."""
     photos: list[dict[str, Any]] = []
     traced = {
-        name: _traced(name, _TOOLS * number + slot, seed, folder / name, photos)
+        name: _traced(name, _TOOLS * number + slot, seed, shots, folder / name, photos)
         for slot, name in enumerate(_names(number, seed))
     }
     names = [name for name, place in traced.items() if place is not None]
@@ -97,9 +100,9 @@ def _names(number: int, seed: int) -> list[str]:
 
 
 def _traced(
-    name: str, index: int, seed: int, folder: Path, photos: list[dict[str, Any]]
+    name: str, index: int, seed: int, shots: int, folder: Path, photos: list[dict[str, Any]]
 ) -> Path | None:
-    """Traces a tool, and appends its photos to `photos`.
+    """Traces a tool, and appends its scenes to `photos`.
 
     Returns:
         The folder of the traced tool; None if the tracer refuses all photos or doubts their
@@ -111,18 +114,20 @@ def _traced(
         drawn = dataclasses.replace(drawn, height=1e3 * true.height)
         place = folder / f"photo_{attempt}"
         place.mkdir(parents=True, exist_ok=True)
-        (place / "photo.jpg").write_bytes(draw_photo([drawn], spec))
         entry: dict[str, Any] = {"tool": name, "tilt_deg": spec.tilt, "ground": spec.ground}
         photos.append(entry)
-        request = TraceRequest(place / "photo.jpg", place, heights_mm=(drawn.height,), name=name)
+        taken = write_photos(place, spec, drawn, shots)
+        heights = (drawn.height,) if shots == 1 else ()
+        request = TraceRequest(taken, place, heights_mm=heights, name=name)
         try:
             report = trace(request)
         except UserError as error:
             entry["refused"] = str(error)
             continue
+        traced = max(report.tools, key=lambda tool: tool.outline.area())
         entry["doubts"] = sum(len(tool.doubts) for tool in report.tools)
+        entry["height_error_mm"] = (traced.height_mm or 0.0) - drawn.height
         if not entry["doubts"]:
-            traced = max(report.tools, key=lambda tool: tool.outline.area())
             place = folder / "tools"
             return import_traced(traced, true.category, f"traced_{name}", place).directory
     return None
@@ -149,6 +154,10 @@ def _summary(lines: list[dict[str, Any]]) -> dict[str, Any]:
         "photos_in_doubt": sum(bool(photo.get("doubts")) for photo in photos),
         "photos_refused": sum("refused" in photo for photo in photos),
         "peak_force_n": max(forces, default=None),
+        "height_error_mm": max(
+            (abs(photo["height_error_mm"]) for photo in photos if photo.get("doubts") == 0),
+            default=None,
+        ),
     }
 
 
@@ -158,13 +167,15 @@ def traced_kits_table(measured: dict[str, Any]) -> Table:
     low, high = measured["interval"]
     table.add_row("strict successes", f"{measured['strict']} of {measured['tools']}")
     table.add_row("95 % interval, %", f"{100 * low:.0f} to {100 * high:.0f}")
-    table.add_row("tools left out: all photos in doubt", str(measured["left_out"]))
+    table.add_row("tools left out: all scenes in doubt", str(measured["left_out"]))
     table.add_row(
-        "photos; in doubt, refused",
+        "scenes photographed; in doubt, refused",
         f"{measured['photos']}; {measured['photos_in_doubt']}, {measured['photos_refused']}",
     )
     if measured["peak_force_n"] is not None:
         table.add_row("largest force, N", f"{measured['peak_force_n']:.0f}")
+    if measured["shots"] > 1 and measured["height_error_mm"] is not None:
+        table.add_row("largest error of a height, mm", f"{measured['height_error_mm']:.1f}")
     for name, cause in measured["failed"].items():
         table.add_row(f"failed: {name}", cause)
     return table

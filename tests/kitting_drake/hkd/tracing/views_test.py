@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from manifold3d import CrossSection
 
-from kitting_drake.hkd.tracing.tool_height import outline_of_silhouette
+from kitting_drake.hkd.tracing.views import outline_of_silhouette
 
 CAMERA = np.array([-60.0, 20.0, 400.0])
 
