@@ -9,6 +9,9 @@ from systems.hand_geometry import PALM_HEIGHT
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import SurfaceHeights
 
+_THIN = 0.15
+"""The fingertips are above the table by at most this share of the object's height, so that the pads
+enclose the widest section of a thin round object."""
 _PALM_ROOM = 0.0025
 """Distance that the palm keeps from surfaces below it, in m."""
 _LEAST_DEPTH = 0.005
@@ -44,8 +47,9 @@ def motion_heights(heights: SurfaceHeights, parameters: PickPlaceParameters) -> 
         heights: the heights of the surfaces, as `read_surface_heights` returns them.
         parameters: the parameters of the motion primitive.
     """
-    floor = heights.table + parameters.floor_clearance
-    share = parameters.grasp_depth_share * (heights.pick_top - heights.support)
+    height = max(heights.pick_top - heights.support, 0.0)
+    floor = heights.table + min(parameters.floor_clearance, _THIN * height)
+    share = parameters.grasp_depth_share * height
     depth = max(parameters.grasp_depth, min(share, parameters.max_grasp_depth))
     grasp = max(heights.pick_top - depth, floor)
     room = heights.below_palm + _PALM_ROOM - PALM_HEIGHT
