@@ -12,6 +12,8 @@ from systems.signals import SurfaceHeights
 _THIN = 0.15
 """The fingertips are above the table by at most this share of the object's height, so that the pads
 enclose the widest section of a thin round object."""
+_LEAST_FLOOR = 0.0005
+"""The least clearance of the fingertips above the table, in m."""
 _PALM_ROOM = 0.0025
 """Distance that the palm keeps from surfaces below it, in m."""
 _LEAST_DEPTH = 0.005
@@ -48,7 +50,7 @@ def motion_heights(heights: SurfaceHeights, parameters: PickPlaceParameters) -> 
         parameters: the parameters of the motion primitive.
     """
     height = max(heights.pick_top - heights.support, 0.0)
-    floor = heights.table + min(parameters.floor_clearance, _THIN * height)
+    floor = heights.table + min(parameters.floor_clearance, max(_THIN * height, _LEAST_FLOOR))
     share = parameters.grasp_depth_share * height
     depth = max(parameters.grasp_depth, min(share, parameters.max_grasp_depth))
     grasp = max(heights.pick_top - depth, floor)

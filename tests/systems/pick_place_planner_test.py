@@ -508,9 +508,10 @@ def test_heights_come_from_the_action_or_else_from_the_observation():
     run = Run(observation=seen(table=0.01, pick=0.04)).until(Mode.CLOSE)
     assert run.output("desired_motion")[2] == pytest.approx(0.04 - PARAMETERS.grasp_depth)
     # The hand stays above the table, whatever the table's height is.
-    run = Run(observation=seen(table=0.01, pick=0.012)).until(Mode.CLOSE)
+    run = Run(observation=seen(table=0.01, pick=0.021)).until(Mode.CLOSE)
     assert run.output("desired_motion")[2] == pytest.approx(0.01 + PARAMETERS.floor_clearance)
-    run = Run(World(touch_place=NO_TOUCH), observation=seen(table=0.01)).until(Mode.RELEASE)
+    observation = seen(table=0.01, pick=0.021)
+    run = Run(World(touch_place=NO_TOUCH), observation=observation).until(Mode.RELEASE)
     assert run.output("desired_motion")[2] == pytest.approx(0.01 + PARAMETERS.floor_clearance)
 
 
