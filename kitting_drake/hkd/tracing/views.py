@@ -49,13 +49,16 @@ _NO_SHADOW = 1.3
 """A region darker than the ground by more than this, in logarithms of light, is not in shadow."""
 _NEEDED = 0.5
 """A region is needed to explain a silhouette if at least this share of it would do so."""
-_SAME_PLACE = 0.6
-"""Two photos must agree on at least this share of the area of the tools."""
+_SAME_PLACE = 0.5
+"""Two photos must agree on at least this share of the area of the tools, at one of the heights
+`_TRIED_MM`."""
+_TRIED_MM = (0.5, 6.0, 12.0, 20.0, 30.0)
 _LEAST_BASELINE = 0.2
 """Two photos show the height of a tool if the points below their cameras are at least this far
 apart, as a share of the cameras' height."""
 _HEIGHTS_MM = (0.5, 80.0)
 _CLEARLY = 1.15
+"""Two photos must agree better than after half a turn of the sheet by at least this factor."""
 
 
 @dataclass(frozen=True)
@@ -145,21 +148,30 @@ def aligned(view: View, first: View) -> View:
     assert sheet is not None
     assert other is not None
     quarters = (0, 2) if np.allclose(sheet, other) else (1, 3)
-
     turns = []
     for angle in (90.0 * quarter for quarter in quarters):
         c, s = math.cos(math.radians(angle)), math.sin(math.radians(angle))
         rotation = np.array([[c, -s], [s, c]])
         turns.append(np.column_stack([rotation, sheet / 2 - rotation @ other / 2]))
-    overlaps = [(view.silhouette.transform(turn) ^ first.silhouette).area() for turn in turns]
-    best = int(np.argmax(overlaps))
-    least = min(view.silhouette.area(), first.silhouette.area())
-    if overlaps[best] < _SAME_PLACE * least or overlaps[best] < _CLEARLY * overlaps[1 - best]:
+    moved = [_moved(view, turn) for turn in turns]
+    alike = [
+        max(
+            _agreement(first.silhouette, first, other.silhouette, other, height)
+            for height in _TRIED_MM
+        )
+        for other in moved
+    ]
+    best = int(np.argmax(alike))
+    if alike[best] < _SAME_PLACE or alike[best] < _CLEARLY * alike[1 - best]:
         raise UserError(
             f"{first.photo.path} and {view.photo.path} do not show the same tools at the same "
             "places on the sheet: leave tools and sheet as they are between the photos"
         )
-    turn = turns[best]
+    return moved[best]
+
+
+def _moved(view: View, turn: Array) -> View:
+    """Returns a view after a rigid motion (2, 3) of its plane's frame."""
     return replace(
         view,
         silhouette=view.silhouette.transform(turn),
@@ -167,6 +179,22 @@ def aligned(view: View, first: View) -> View:
         unclear=tuple(Unclear(item.region.transform(turn), item.area) for item in view.unclear),
         turn=turn,
     )
+
+
+def _agreement(
+    area: CrossSection,
+    view: View,
+    other_area: CrossSection,
+    other: View,
+    height: float,
+    edges: str = EDGES[0],
+) -> float:
+    """The area that is in the outlines from both of two silhouettes, as a share of the area that is
+    in at least one of them."""
+    mine = outline_of_silhouette(area, view.camera, height, edges)
+    theirs = outline_of_silhouette(other_area, other.camera, height, edges)
+    whole = (mine + theirs).area()
+    return (mine ^ theirs).area() / whole if whole else 0.0
 
 
 def outline_in_views(
@@ -280,12 +308,10 @@ def height_in_views(part: CrossSection, views: Sequence[View], edges: str) -> fl
     near = [_near(view, part) for view in views[1:]]
 
     def disagreement(height: float) -> float:
-        mine = outline_of_silhouette(part, first.camera, height, edges)
-        total = 0.0
-        for view, area in zip(views[1:], near, strict=True):
-            other = outline_of_silhouette(area, view.camera, height, edges)
-            total += mine.area() + other.area() - 2 * (mine ^ other).area()
-        return total
+        return -sum(
+            _agreement(part, first, area, view, height, edges)
+            for view, area in zip(views[1:], near, strict=True)
+        )
 
     highest = min(_HEIGHTS_MM[1], _SHARE_OF_HEIGHT * min(float(v.camera[2]) for v in views))
     tried = np.geomspace(_HEIGHTS_MM[0], highest, 14)
