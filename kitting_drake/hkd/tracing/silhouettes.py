@@ -100,7 +100,7 @@ def find_silhouettes(
     if not mask.any():
         return Silhouettes(CrossSection(), 0.0, (), lightness)
     soft = soft_mask(cv2, photo, mask)
-    area = _cleaned(contours(photo, soft))
+    area = cleaned(contours(photo, soft))
     differ = (mask ^ masks.mask(BOLD)) | masks.shine(mask)
     unclear = [*_unclear(cv2, photo, differ), *_blended(cv2, photo, masks.blended(mask))]
     unclear.sort(key=lambda item: -item.area)
@@ -160,7 +160,7 @@ def _polygon(cv2: Any, photo: RectifiedPhoto, polygon: Array) -> Array:
     return mask > 0
 
 
-def _cleaned(area: CrossSection) -> CrossSection:
+def cleaned(area: CrossSection) -> CrossSection:
     """Removes specks and tiny holes from a region."""
     result = CrossSection()
     for part in area.decompose():

@@ -21,7 +21,7 @@ from kitting_drake.hkd.tracing.corrections import Corrections
 from kitting_drake.hkd.tracing.photo_file import Photo
 from kitting_drake.hkd.tracing.plane_view import RectifiedPhoto
 from kitting_drake.hkd.tracing.sheet_plane import GroundPlane
-from kitting_drake.hkd.tracing.silhouettes import Unclear, lightness_in
+from kitting_drake.hkd.tracing.silhouettes import Unclear, cleaned, lightness_in
 
 Array = NDArray[np.float64]
 
@@ -219,6 +219,8 @@ def outline_in_views(
                 "away"
             )
     outline = _corrected(part, views, height, edges)
+    if len(views) > 1:
+        outline = cleaned(outline)
     pieces = sorted(outline.decompose(), key=lambda piece: -piece.area())
     if not pieces or pieces[0].area() < 0.5 * part.area():
         raise UserError(
