@@ -309,7 +309,7 @@ def height_in_views(part: CrossSection, views: Sequence[View], edges: str) -> fl
         )
     near = [_near(view, part) for view in views[1:]]
 
-    def disagreement(height: float) -> float:
+    def misfit(height: float) -> float:
         return -sum(
             _agreement(part, first, area, view, height, edges)
             for view, area in zip(views[1:], near, strict=True)
@@ -317,10 +317,10 @@ def height_in_views(part: CrossSection, views: Sequence[View], edges: str) -> fl
 
     highest = min(_HEIGHTS_MM[1], _SHARE_OF_HEIGHT * min(float(v.camera[2]) for v in views))
     tried = np.geomspace(_HEIGHTS_MM[0], highest, 14)
-    best = int(np.argmin([disagreement(float(height)) for height in tried]))
+    best = int(np.argmin([misfit(float(height)) for height in tried]))
     bounds = tried[max(best - 1, 0)], tried[min(best + 1, len(tried) - 1)]
     found = optimize.minimize_scalar(
-        disagreement, bounds=bounds, method="bounded", options={"xatol": 0.1}
+        misfit, bounds=bounds, method="bounded", options={"xatol": 0.1}
     )
     return round(float(found.x), 1)
 
