@@ -161,6 +161,7 @@ class PickPlaceSteps:
         state.lowers_next = 0
         state.payload = min(float(moment.contact[2]), 0.0)
         state.floor_z, state.rim_z = state.travel_z, state.table_z
+        state.place_hover_z = float(moment.hand[2]) + self._parameters.hover_clearance
         self._motion.begin(state, Mode.LOWER, moment.time)
 
     def _lay_down(self, moment: Moment) -> None:

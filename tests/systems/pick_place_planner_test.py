@@ -685,6 +685,18 @@ def test_the_hand_goes_down_again_if_an_object_hangs_on_it(force: float, layings
     assert run.counts == [1, 0, 0]
 
 
+def test_a_hanging_object_is_lowered_slowly_from_the_start():
+    """It may hang by any length, so it may touch the ground at once."""
+    run = Run(Jam(mode=Mode.RETREAT, force=(0.0, 0.0, -2.0)), is_logged=True).finish()
+    layings = [i for i, (_, mode) in enumerate(run.modes) if mode == Mode.LOWER][1:]
+    log = run.log.FindLog(run.simulator.get_context())
+    for i in layings:
+        inside = (log.sample_times() > run.modes[i][0]) & (log.sample_times() < run.modes[i + 1][0])
+        z, times = log.data()[2, inside], log.sample_times()[inside]
+        assert np.ptp(z) > 0.02
+        assert np.abs(np.diff(z) / np.diff(times)).max() < 1.05 * PARAMETERS.contact_speed
+
+
 def test_jaws_that_lay_an_object_down_open_fully_and_then_close_half_of_the_way():
     run = Run(Jam(mode=Mode.RETREAT, force=(0.0, 0.0, -2.0)))
     retreats = []
