@@ -9,11 +9,11 @@ from systems.hand_geometry import PALM_HEIGHT
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import SurfaceHeights
 
-_THIN = 0.15
-"""The fingertips are above the table by at most this share of the object's height, so that the pads
-enclose the widest section of a thin round object."""
-_LEAST_FLOOR = 0.0005
-"""The least clearance of the fingertips above the table, in m."""
+_THIN = 0.010
+"""Below this height of an object, in m, the fingertips' clearance above the table is reduced in
+proportion, so that the pads enclose the widest section of a thin round object."""
+_LEAST_SHARE = 0.3
+"""The least clearance of the fingertips above the table, as a share of `floor_clearance`."""
 _PALM_ROOM = 0.0025
 """Distance that the palm keeps from surfaces below it, in m."""
 _LEAST_DEPTH = 0.005
@@ -50,7 +50,8 @@ def motion_heights(heights: SurfaceHeights, parameters: PickPlaceParameters) -> 
         parameters: the parameters of the motion primitive.
     """
     height = max(heights.pick_top - heights.support, 0.0)
-    floor = heights.table + min(parameters.floor_clearance, max(_THIN * height, _LEAST_FLOOR))
+    low = min(max(height / _THIN, _LEAST_SHARE), 1.0)
+    floor = heights.table + low * parameters.floor_clearance
     share = parameters.grasp_depth_share * height
     depth = max(parameters.grasp_depth, min(share, parameters.max_grasp_depth))
     grasp = max(heights.pick_top - depth, floor)

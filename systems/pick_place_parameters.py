@@ -63,7 +63,7 @@ class PickPlaceParameters:
     max_grasp_depth: float = bounded(0.018, 0.001, 0.05)
     grasp_depth_share: float = bounded(0.4, 0.0, 1.0)
 
-    # Least height of the fingertips above the table, in m.
+    # Least height of the fingertips above the table, in m; less for objects lower than 10 mm.
     floor_clearance: float = bounded(0.0015, 0.0, 0.05)
 
     # Opening of the jaws before a grasp, in m.

@@ -171,7 +171,7 @@ def _add_trace(benchmarks: Any) -> None:
         "--keep", action="store_true", help="keep the photos and pictures in the folder photos"
     )
     tracing.add_argument("--seed", type=int, default=0, help="seed of the photos (default: 0)")
-    _add_photos(tracing, default=1)
+    _add_photos(tracing)
 
 
 def _add_traced_kits(benchmarks: Any) -> None:
@@ -185,16 +185,16 @@ def _add_traced_kits(benchmarks: Any) -> None:
         "--fit", choices=("snug", "easy", "loose"), default="easy", help="the clearance (easy)"
     )
     traced.add_argument("--seed", type=seed_type, default=0, help="seed of photos and scenes (0)")
-    _add_photos(traced, default=1)
+    _add_photos(traced)
 
 
-def _add_photos(benchmark: argparse.ArgumentParser, default: int) -> None:
+def _add_photos(benchmark: argparse.ArgumentParser) -> None:
     benchmark.add_argument(
         "--photos",
         type=int,
         choices=(1, 2, 3, 4),
-        default=default,
-        help=f"number of photos of each scene, from different sides ({default})",
+        default=1,
+        help="number of photos of each scene, from different sides (1)",
     )
 
 

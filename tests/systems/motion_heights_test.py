@@ -12,3 +12,8 @@ def test_the_pads_enclose_the_middle_of_a_thin_object(height: float, tip: float)
     surfaces = SurfaceHeights(pick_top=table + height, support=table, table=table)
     found = motion_heights(surfaces, PickPlaceParameters()).grasp
     assert found == pytest.approx(table + tip)
+
+
+def test_a_larger_clearance_counts_at_thin_objects_too():
+    wider = PickPlaceParameters(floor_clearance=0.003)
+    assert motion_heights(SurfaceHeights(pick_top=0.005), wider).grasp == pytest.approx(0.0015)

@@ -136,7 +136,7 @@ def trace_photo(args: argparse.Namespace) -> None:
     """Traces photos and prints what was found; imports the tools on request.
 
     Raises:
-        UserError: the arguments or the photo cannot be used.
+        UserError: the arguments or the photos cannot be used.
     """
     # Import lazily, because OpenCV is slow to import.
     from kitting_drake.hkd.tracing.tracer import TraceRequest, trace
@@ -167,8 +167,8 @@ def trace_photo(args: argparse.Namespace) -> None:
     categories = args.category * len(report.tools) if len(args.category) == 1 else args.category
     if len(categories) != len(report.tools):
         raise UserError(
-            f"--category has {len(categories)} names, and the photo shows {len(report.tools)} "
-            "tools: give one name, or one for each tool from left to right"
+            f"--category has {len(categories)} names, and {args.photos[0]} shows "
+            f"{len(report.tools)} tools: give one name, or one for each tool from left to right"
         )
     made = []
     for tool, category in zip(report.tools, categories, strict=True):

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.extras import import_extra
 from kitting_drake.common.files import require_folder, write_atomically, write_json
-from kitting_drake.hkd.tracing.corrections import Corrections, read_corrections
+from kitting_drake.hkd.tracing.doubts import Corrections, doubts_of, read_corrections
 from kitting_drake.hkd.tracing.photo_file import Photo, read_photo
 from kitting_drake.hkd.tracing.plane_view import RectifiedPhoto, rectify
 from kitting_drake.hkd.tracing.scales import Scale, plane_of_scale
@@ -30,9 +30,8 @@ from kitting_drake.hkd.tracing.trace_files import outlines_dxf, outlines_svg, tr
 from kitting_drake.hkd.tracing.views import (
     View,
     aligned,
-    doubts_of,
     height_in_views,
-    outline_in_views,
+    outlines_in_views,
 )
 
 _STEEPEST = math.radians(30)
@@ -62,11 +61,11 @@ class TraceRequest:
     """The tools' heights, from left to right, or one height for all tools. Empty: no correction if
     there is one photo; else the heights are found from the photos."""
     edges: str = "upright"
-    """One of `tool_height.EDGES`."""
+    """One of `views.EDGES`."""
     camera_mm: float | None = None
     """The camera's height above the plane. None: computed from the focal length."""
     points: Path | None = None
-    """A file of corrections; see `corrections`."""
+    """A file of corrections; see `doubts`."""
     name: str | None = None
     """The name of the outlines. None: the first photo's name."""
 
@@ -120,40 +119,43 @@ def trace(request: TraceRequest) -> TraceReport:
     cv2 = import_extra("cv2", purpose="hkd trace", extra="camera")
     name = _checked(request)
     corrections = read_corrections(request.points) if request.points else Corrections()
-    corners = (corrections.corners, *[None] * (len(request.photos) - 1))
-    views = [
-        _look(cv2, request, path, sheet)
-        for path, sheet in zip(request.photos, corners, strict=True)
-    ]
-    views = [views[0], *(aligned(view, views[0]) for view in views[1:])]
-    views = [replace(view, silhouette=corrections.applied(view.silhouette)) for view in views]
-    parts = [part for part in views[0].silhouette.decompose() if part.area() > 0]
+    first = _look(cv2, request, request.photos[0], corrections.corners)
+    others = [_look(cv2, request, path) for path in request.photos[1:]]
+    if not others:
+        first = replace(first, silhouette=corrections.applied(first.silhouette))
+    parts = [part for part in first.silhouette.decompose() if part.area() > 0]
     if not parts:
         raise UserError(
             f"{request.photos[0]}: no tool is seen: use a ground of another colour, or add the "
-            "tool with --points"
+            "tool with --points and one photo"
         )
+    for view in (first, *others):
+        _check_edges(view)
+    views = [first, *(aligned(view, first) for view in others)]
     parts.sort(key=lambda part: part.bounds()[0])
     heights = _heights(request, parts, views)
-    outlines = [
-        part if height is None else outline_in_views(part, views, height, request.edges)
-        for part, height in zip(parts, heights, strict=True)
-    ]
+    outlines = outlines_in_views(parts, views, heights, request.edges)
+    if others:
+        outlines = [corrections.near(outline).applied(outline) for outline in outlines]
     names = [name] if len(parts) == 1 else [f"{name}_{i + 1}" for i in range(len(parts))]
     doubts = doubts_of(parts, outlines, heights, views, request.edges, corrections)
     tools = [
         TracedTool(own, outline, height, request.output / f"{own}.svg", doubtful)
         for own, outline, height, doubtful in zip(names, outlines, heights, doubts, strict=True)
     ]
-    notes = [*views[0].plane.notes, *_view_notes(views, request, tools)]
-    _write(cv2, request, tools, notes, views[0])
+    notes = [
+        note if view is first else f"{view.photo.path.name}: {note}"
+        for view in views
+        for note in view.plane.notes
+    ]
+    notes += _view_notes(views, request, tools)
+    _write(cv2, request, tools, notes, views)
     return TraceReport(tools, notes)
 
 
 def _checked(request: TraceRequest) -> str:
-    name = (
-        request.name or re.sub(r"[^a-z0-9]+", "_", request.photos[0].stem.lower()).strip("_")[:50]
-    )
+    stem = request.photos[0].stem.lower()
+    name = request.name or re.sub(r"[^a-z0-9]+", "_", stem).strip("_")[:50]
     if not re.fullmatch(r"[a-z0-9][a-z0-9_]{0,60}", name):
         raise UserError(
             f"the name '{name}' is not valid: give a --name of at most 61 lower-case letters, "
@@ -161,6 +163,8 @@ def _checked(request: TraceRequest) -> str:
         )
     if len(request.photos) > 1 and request.scale is not None:
         raise UserError("several photos need a sheet of paper below the tools, not another scale")
+    if len(request.photos) > 1 and request.camera_mm is not None:
+        raise UserError("--camera_mm is for one photo: leave it out, or trace one photo")
     if len(request.photos) > _MOST_PHOTOS:
         raise UserError(f"{len(request.photos)} photos are too many: give up to {_MOST_PHOTOS}")
     for flag, values, (low, high) in (
@@ -204,9 +208,13 @@ def _look(
         found = find_silhouettes(cv2, seen, plane.sheet, plane.hidden, lowest)
     except UserError as error:
         raise UserError(f"{photo.path}: {error}") from error
-    view = View(photo, plane, seen, found.lightness, found.area, found.unclear, plane.view.camera)
-    _check_silhouette(view, max(found.blur_mm, plane.blur_mm))
-    return view
+    blur = max(found.blur_mm, plane.blur_mm)
+    if blur > _BLURRED_MM:
+        raise UserError(
+            f"{path} is blurred: edges are {blur:.1f} mm wide; take it again, with more light or a "
+            "steadier hand"
+        )
+    return View(photo, plane, seen, found.lightness, found.area, found.unclear, plane.view.camera)
 
 
 def _rectified(cv2: Any, plane: GroundPlane) -> RectifiedPhoto:
@@ -221,14 +229,9 @@ def _rectified(cv2: Any, plane: GroundPlane) -> RectifiedPhoto:
     return rectify(cv2, plane.pixels, plane.view, low, high, px_per_mm)
 
 
-def _check_silhouette(view: View, blur: float) -> None:
-    """Raises a UserError if a photo is blurred or does not show a whole tool."""
+def _check_edges(view: View) -> None:
+    """Raises a UserError if a photo does not show a whole tool."""
     path, seen = view.photo.path, view.seen
-    if blur > _BLURRED_MM:
-        raise UserError(
-            f"{path} is blurred: edges are {blur:.1f} mm wide; take it again, with more light or a "
-            "steadier hand"
-        )
     for loop in view.silhouette.to_polygons():
         u, v = np.round(seen.to_px(np.asarray(loop))).astype(int).T
         rows, columns = seen.shape
@@ -276,7 +279,7 @@ def _view_notes(views: list[View], request: TraceRequest, tools: list[TracedTool
 
 
 def _write(
-    cv2: Any, request: TraceRequest, tools: list[TracedTool], notes: list[str], view: View
+    cv2: Any, request: TraceRequest, tools: list[TracedTool], notes: list[str], views: list[View]
 ) -> None:
     outlines = {tool.name: tool.outline for tool in tools}
     files: dict[str, str | bytes] = {}
@@ -290,11 +293,11 @@ def _write(
         )
     files["trace.png"] = trace_png(
         cv2,
-        view.seen,
-        view.silhouette,
+        views[0].seen,
+        views[0].silhouette,
         outlines,
         [item.place for tool in tools for item in tool.doubts],
-        view.photo.path.name,
+        views[0].photo.path.name,
     )
     folder = require_folder(request.output)
     for file, content in files.items():
@@ -302,10 +305,15 @@ def _write(
     write_json(
         folder / "trace.json",
         {
-            "photos": [str(path) for path in request.photos],
+            "photos": [
+                {
+                    "file": str(view.photo.path),
+                    "camera_mm": np.round(view.camera, 2).tolist(),
+                    "tilt_deg": round(math.degrees(view.plane.view.tilt), 2),
+                }
+                for view in views
+            ],
             "notes": notes,
-            "camera_mm": np.round(view.camera, 2).tolist(),
-            "tilt_deg": round(math.degrees(view.plane.view.tilt), 2),
             "edges": request.edges,
             "corrections": str(request.points) if request.points else None,
             "tools": [

@@ -17,7 +17,6 @@ from scipy import optimize
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.extras import import_extra
-from kitting_drake.hkd.tracing.corrections import Corrections
 from kitting_drake.hkd.tracing.photo_file import Photo
 from kitting_drake.hkd.tracing.plane_view import RectifiedPhoto
 from kitting_drake.hkd.tracing.sheet_plane import GroundPlane
@@ -31,17 +30,13 @@ EDGES = ("upright", "round")
 _STEP_MM = 0.4
 _SHARE_OF_HEIGHT = 0.5
 """A tool may be at most this high, as a share of the camera's height."""
-_DOUBTED_MM = 0.12
-"""An outline is in doubt if the area of its unclear regions, divided by its perimeter, exceeds
-this, in mm."""
-_MOST_DOUBTS = 4
-_APART_MM = 15.0
-"""Silhouettes closer than this, in mm, may belong to one tool."""
 _SLACK_MM = 0.4
 """Strips of a silhouette that the outline does not explain are ignored if they are narrower than
 twice this, in mm."""
-_SETTLED_MM = 3.0
-"""An unclear region is settled if another photo has none within this distance, in mm."""
+_OVERLAP = 0.3
+"""Outlines from two photos belong to one tool if they overlap by this share of the smaller one."""
+_SAME_TOOL = 0.4
+"""The least `_agreement` of a tool's outlines from two photos."""
 _ALIKE = 0.15
 """The largest difference between the brightness of the ground in two photos, in logarithms of
 light."""
@@ -98,7 +93,7 @@ def outline_of_silhouette(
         height: the tool's height t in mm, less than H.
         edges: one of `EDGES`.
     """
-    scaled = _at_scales(silhouette, camera, height, edges, toward=-1)
+    scaled = at_scales(silhouette, camera, height, edges, toward=-1)
     return CrossSection.batch_boolean(scaled, OpType.Intersect)
 
 
@@ -111,11 +106,11 @@ def silhouette_of_outline(
     tool's outline.
     """
     return CrossSection.batch_boolean(
-        _at_scales(outline, camera, height, edges, toward=1), OpType.Add
+        at_scales(outline, camera, height, edges, toward=1), OpType.Add
     )
 
 
-def _at_scales(
+def at_scales(
     area: CrossSection, camera: Array, height: float, edges: str, toward: int
 ) -> list[CrossSection]:
     """Returns copies of an area, scaled about the point below the camera; see
@@ -139,35 +134,50 @@ def aligned(view: View, first: View) -> View:
     """Returns a view in the frame of the first view, which has the same sheet.
 
     The sheets' frames differ by a multiple of a quarter turn about the sheet's middle. It is chosen
-    such that the silhouettes overlap most.
+    such that the outlines agree best.
 
     Raises:
-        UserError: the two photos do not show the same tools at the same places.
+        UserError: the two photos do not show the same sheet, or the same tools at the same places.
     """
     sheet, other = first.plane.sheet, view.plane.sheet
     assert sheet is not None
     assert other is not None
-    quarters = (0, 2) if np.allclose(sheet, other) else (1, 3)
-    turns = []
-    for angle in (90.0 * quarter for quarter in quarters):
-        c, s = math.cos(math.radians(angle)), math.sin(math.radians(angle))
-        rotation = np.array([[c, -s], [s, c]])
-        turns.append(np.column_stack([rotation, sheet / 2 - rotation @ other / 2]))
-    moved = [_moved(view, turn) for turn in turns]
+    if not np.allclose(sorted(sheet), sorted(other)):
+        raise UserError(
+            f"{first.photo.path} shows a sheet of {sheet[0]:g} x {sheet[1]:g} mm, and "
+            f"{view.photo.path} one of {other[0]:g} x {other[1]:g} mm: say which it is with --sheet"
+        )
+    quarters = [q for q in range(4) if np.allclose(sheet, other if q % 2 == 0 else other[::-1])]
+    moved = []
+    for angle in (math.pi / 2 * quarter for quarter in quarters):
+        rotation = np.array(
+            [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
+        )
+        turn = np.column_stack([rotation, sheet / 2 - rotation @ other / 2])
+        moved.append(_moved(view, turn))
     alike = [
         max(
-            _agreement(first.silhouette, first, other.silhouette, other, height)
+            _agreement(
+                outline_of_silhouette(first.silhouette, first.camera, height, EDGES[0]),
+                outline_of_silhouette(turned.silhouette, turned.camera, height, EDGES[0]),
+            )
             for height in _TRIED_MM
         )
-        for other in moved
+        for turned in moved
     ]
-    best = int(np.argmax(alike))
-    if alike[best] < _SAME_PLACE or alike[best] < _CLEARLY * alike[1 - best]:
+    second, best = sorted(alike)[-2:]
+    if best < _SAME_PLACE:
         raise UserError(
             f"{first.photo.path} and {view.photo.path} do not show the same tools at the same "
             "places on the sheet: leave tools and sheet as they are between the photos"
         )
-    return moved[best]
+    if best < _CLEARLY * second:
+        raise UserError(
+            f"{first.photo.path} and {view.photo.path}: the tools look the same if the sheet is "
+            "turned, so it is not clear from which side the photos were taken: lay the tools "
+            "away from the middle of the sheet"
+        )
+    return moved[int(np.argmax(alike))]
 
 
 def _moved(view: View, turn: Array) -> View:
@@ -181,108 +191,21 @@ def _moved(view: View, turn: Array) -> View:
     )
 
 
-def _agreement(
-    area: CrossSection,
-    view: View,
-    other_area: CrossSection,
-    other: View,
-    height: float,
-    edges: str = EDGES[0],
-) -> float:
-    """The area that is in the outlines from both of two silhouettes, as a share of the area that is
-    in at least one of them."""
-    mine = outline_of_silhouette(area, view.camera, height, edges)
-    theirs = outline_of_silhouette(other_area, other.camera, height, edges)
-    whole = (mine + theirs).area()
-    return (mine ^ theirs).area() / whole if whole else 0.0
+def _agreement(outline: CrossSection, other: CrossSection) -> float:
+    """The area that is in both of two outlines, as a share of the area that is in one of them."""
+    whole = (outline + other).area()
+    return (outline ^ other).area() / whole if whole else 0.0
 
 
-def outline_in_views(
-    part: CrossSection, views: Sequence[View], height: float, edges: str
-) -> CrossSection:
-    """Computes a tool's outline from one or several photos.
-
-    Args:
-        part: the tool's silhouette in the first photo.
-        views: the photos.
-        height: the tool's height in mm.
-        edges: one of `EDGES`.
-
-    Raises:
-        UserError: the tool is too high for its photos.
-    """
-    for view in views:
-        if height > _SHARE_OF_HEIGHT * view.camera[2]:
-            raise UserError(
-                f"{view.photo.path}: the camera is only {view.camera[2]:.0f} mm above the ground, "
-                f"which is too close for a tool {height:g} mm high: take the photo from farther "
-                "away"
-            )
-    outline = _corrected(part, views, height, edges)
-    if len(views) > 1:
-        outline = cleaned(outline)
-    pieces = sorted(outline.decompose(), key=lambda piece: -piece.area())
-    if not pieces or pieces[0].area() < 0.5 * part.area():
-        raise UserError(
-            f"{views[0].photo.path}: the correction for a tool {height:g} mm high leaves less than "
-            "half of its silhouette: give its true height, or take the photo from straight above"
-        )
-    return pieces[0]
-
-
-def _corrected(
-    part: CrossSection, views: Sequence[View], height: float, edges: str
-) -> CrossSection:
-    """Computes the outline that agrees best with the photos.
-
-    It lies within the outlines from all photos, except for regions that one photo shows as tool and
-    another one as ground. There the brightness decides: the ground and its shadows look alike from
-    all sides, and a reflection does not.
-    """
-    from_views = [outline_of_silhouette(part, views[0].camera, height, edges)]
-    seen = [part, *(_near(view, part) for view in views[1:])]
-    for view, area in zip(views[1:], seen[1:], strict=True):
-        from_views.append(outline_of_silhouette(area, view.camera, height, edges))
-    outline = CrossSection.batch_boolean(from_views, OpType.Intersect)
-    if len(views) == 1:
-        return outline
-    added = [outline]
-    for view, area, own in zip(views, seen, from_views, strict=True):
-        left = _opened(area - silhouette_of_outline(outline, view.camera, height, edges))
-        if left.is_empty():
-            continue
-        for region in _opened(own - outline).decompose():
-            needed = silhouette_of_outline(region, view.camera, height, edges) ^ left
-            if needed.area() > _NEEDED * region.area() and not _is_ground(region, views):
-                added.append(region.offset(_SLACK_MM / 4, JoinType.Round) ^ own)
-    return CrossSection.batch_boolean(added, OpType.Add)
-
-
-def _is_ground(region: CrossSection, views: Sequence[View]) -> bool:
-    """Whether a region, in the first photo's frame, is equally bright in all photos, and not
-    darker than a shadow."""
-    cv2 = import_extra("cv2", purpose="hkd trace", extra="camera")
-    light = [
-        lightness_in(cv2, view.seen, view.lightness, region.transform(_inverse(view.turn)))
-        for view in views
-    ]
-    return float(np.ptp(light)) < _ALIKE and min(light) > -_NO_SHADOW
-
-
-def _inverse(turn: Array) -> Array:
-    back = turn[:, :2].T
-    return np.column_stack([back, -back @ turn[:, 2]])
-
-
-def _opened(area: CrossSection) -> CrossSection:
-    """The parts of an area that are wider than twice `_SLACK_MM`."""
-    return area.offset(-_SLACK_MM, JoinType.Round).offset(_SLACK_MM, JoinType.Round)
-
-
-def _near(view: View, part: CrossSection) -> CrossSection:
-    """The silhouettes in another photo that overlap a tool's silhouette in the first photo."""
-    pieces = [piece for piece in view.silhouette.decompose() if not (piece ^ part).is_empty()]
-    return CrossSection.batch_boolean(pieces, OpType.Add) if pieces else CrossSection()
+def _same_tool(outline: CrossSection, view: View, height: float, edges: str) -> CrossSection:
+    """The outline of a tool from another photo: of the silhouettes there that, at a height, overlap
+    the tool's outline from the first photo."""
+    found = [CrossSection()]
+    for piece in view.silhouette.decompose():
+        other = outline_of_silhouette(piece, view.camera, height, edges)
+        if (outline ^ other).area() > _OVERLAP * min(outline.area(), other.area()):
+            found.append(other)
+    return CrossSection.batch_boolean(found, OpType.Add)
 
 
 def height_in_views(part: CrossSection, views: Sequence[View], edges: str) -> float:
@@ -302,18 +225,15 @@ def height_in_views(part: CrossSection, views: Sequence[View], edges: str) -> fl
         for view in views[1:]
     )
     if apart < _LEAST_BASELINE:
+        names = ", ".join(str(view.photo.path) for view in views)
         raise UserError(
-            f"{first.photo.path} and {views[1].photo.path} are taken from nearly the same place, "
-            "so they do not show the tools' height: give --height_mm, or take the photos from "
-            "opposite sides of the sheet"
+            f"{names} are taken from nearly the same place, so they do not show the tools' "
+            "height: give --height_mm, or take the photos from opposite sides of the sheet"
         )
-    near = [_near(view, part) for view in views[1:]]
 
     def misfit(height: float) -> float:
-        return -sum(
-            _agreement(part, first, area, view, height, edges)
-            for view, area in zip(views[1:], near, strict=True)
-        )
+        mine = outline_of_silhouette(part, first.camera, height, edges)
+        return -sum(_agreement(mine, _same_tool(mine, view, height, edges)) for view in views[1:])
 
     highest = min(_HEIGHTS_MM[1], _SHARE_OF_HEIGHT * min(float(v.camera[2]) for v in views))
     tried = np.geomspace(_HEIGHTS_MM[0], highest, 14)
@@ -325,92 +245,140 @@ def height_in_views(part: CrossSection, views: Sequence[View], edges: str) -> fl
     return round(float(found.x), 1)
 
 
-def doubts_of(
+def outlines_in_views(
     parts: Sequence[CrossSection],
-    outlines: Sequence[CrossSection],
-    heights: Sequence[float | None],
     views: Sequence[View],
+    heights: Sequence[float | None],
     edges: str,
-    corrections: Corrections,
-) -> list[tuple[Unclear, ...]]:
-    """Returns, for each tool, the places where its outline may be wrong.
+) -> list[CrossSection]:
+    """Computes the tools' outlines from one or several photos.
 
-    First come narrow gaps to other silhouettes, then unclear regions, the largest first. Places
-    that the user has corrected are left out. With several photos, so are places that another photo
-    shows clearly; added are the parts of silhouettes that the outlines do not explain.
+    An outline lies within the outlines from all photos, except for regions that one photo shows as
+    tool and another one as ground. There the brightness decides: the ground and its shadows look
+    alike from all sides, and a reflection does not.
 
     Args:
         parts: the tools' silhouettes in the first photo.
-        outlines: the tools' outlines.
-        heights: the tools' heights in mm; None where the outline is not corrected.
         views: the photos.
+        heights: the tools' heights in mm; None: the silhouette is not corrected.
         edges: one of `EDGES`.
-        corrections: the user's corrections.
+
+    Raises:
+        UserError: a tool is too high for its photos, or a photo does not show it.
     """
-    unclear = [item for view in views for item in view.unclear if not _is_settled(item, views)]
+    from_views = [
+        [part] if height is None else _outlines(part, views, height, edges)
+        for part, height in zip(parts, heights, strict=True)
+    ]
+    outlines = [CrossSection.batch_boolean(items, OpType.Intersect) for items in from_views]
     if len(views) > 1:
-        unclear += _unexplained(outlines, heights, views, edges)
-    near: list[list[Unclear]] = [[] for _ in parts]
-    for item in sorted(unclear, key=lambda item: -item.area):
-        if corrections.settles(item.place):
-            continue
-        square = CrossSection.square((1.0, 1.0), True).translate(item.place)
-        away = [
-            CrossSection.batch_hull([part.hull(), square]).area() - part.hull().area()
-            for part in parts
-        ]
-        near[int(np.argmin(away))].append(item)
-    result = []
-    for i, (part, items) in enumerate(zip(parts, near, strict=True)):
-        matters = sum(item.area for item in items) > _DOUBTED_MM * _perimeter(part)
-        gaps = [_gap_between(part, other) for j, other in enumerate(parts) if j != i]
-        split = [gap for gap in gaps if gap is not None and not corrections.settles(gap.place)]
-        result.append(tuple([*split, *(items if matters else [])][:_MOST_DOUBTS]))
-    return result
+        outlines = _with_needed(outlines, from_views, views, heights, edges)
+    return [
+        _one_piece(outline, items[0], part, views[0], height)
+        for outline, items, part, height in zip(outlines, from_views, parts, heights, strict=True)
+    ]
 
 
-def _is_settled(item: Unclear, views: Sequence[View]) -> bool:
-    """Whether a photo shows clearly what another one does not."""
-    around = item.region.offset(_SETTLED_MM, JoinType.Round)
-    return any(all((around ^ other.region).is_empty() for other in view.unclear) for view in views)
-
-
-def _unexplained(
-    outlines: Sequence[CrossSection],
-    heights: Sequence[float | None],
-    views: Sequence[View],
-    edges: str,
-) -> list[Unclear]:
-    """Returns the regions of the photos' silhouettes that tools with these outlines and heights
-    would not hide."""
-    found = []
+def _outlines(
+    part: CrossSection, views: Sequence[View], height: float, edges: str
+) -> list[CrossSection]:
+    """Returns a tool's outline from each photo."""
     for view in views:
-        hidden = CrossSection.batch_boolean(
-            [
-                silhouette_of_outline(outline, view.camera, height or 0.0, edges)
-                for outline, height in zip(outlines, heights, strict=True)
-            ],
-            OpType.Add,
-        )
-        left = _opened(view.silhouette - hidden)
-        found += [Unclear(region, region.area()) for region in left.decompose()]
+        if height > _SHARE_OF_HEIGHT * view.camera[2]:
+            raise UserError(
+                f"{view.photo.path}: the camera is only {view.camera[2]:.0f} mm above the ground, "
+                f"which is too close for a tool {height:g} mm high: take the photo from farther "
+                "away"
+            )
+    found = [outline_of_silhouette(part, views[0].camera, height, edges)]
+    for view in views[1:]:
+        found.append(_same_tool(found[0], view, height, edges))
+        if _agreement(found[0], found[-1]) < _SAME_TOOL:
+            x_low, y_low, x_high, y_high = part.bounds()
+            raise UserError(
+                f"{view.photo.path} does not show the tool that {views[0].photo.path} shows at "
+                f"({(x_low + x_high) / 2:.0f}, {(y_low + y_high) / 2:.0f}) mm, if it is "
+                f"{height:g} mm high: leave tools and sheet as they are between the photos, and "
+                "check --height_mm"
+            )
     return found
 
 
-def _gap_between(part: CrossSection, other: CrossSection) -> Unclear | None:
-    """Returns the gap between two close silhouettes; a reflection may have split one tool into two.
+def _with_needed(
+    outlines: Sequence[CrossSection],
+    from_views: Sequence[Sequence[CrossSection]],
+    views: Sequence[View],
+    heights: Sequence[float | None],
+    edges: str,
+) -> list[CrossSection]:
+    """Adds to outlines the regions without which a photo's silhouette cannot be explained, unless
+    they are ground."""
+    added = list(outlines)
+    for number, view in enumerate(views):
+        left = unexplained(outlines, heights, view, edges)
+        if left.is_empty():
+            continue
+        for index, (items, height) in enumerate(zip(from_views, heights, strict=True)):
+            others = CrossSection.batch_boolean(added, OpType.Add)
+            for region in _opened(items[number] - others).decompose():
+                needed = silhouette_of_outline(region, view.camera, height or 0.0, edges) ^ left
+                if needed.area() > _NEEDED * region.area() and not _is_ground(region, views):
+                    added[index] += region.offset(_SLACK_MM / 4, JoinType.Round) ^ items[number]
+    return [cleaned(outline) for outline in added]
 
-    Returns None if they are more than `_APART_MM` apart.
-    """
-    grown = _APART_MM / 2
-    bridge = part.offset(grown, JoinType.Round) ^ other.offset(grown, JoinType.Round)
-    if bridge.is_empty():
-        return None
-    return Unclear(bridge, bridge.area())
+
+def _one_piece(
+    outline: CrossSection,
+    first: CrossSection,
+    part: CrossSection,
+    view: View,
+    height: float | None,
+) -> CrossSection:
+    """Returns the piece of an outline that overlaps the outline from the first photo most."""
+    pieces = sorted(outline.decompose(), key=lambda piece: -(piece ^ first).area())
+    if not pieces or pieces[0].area() < 0.5 * part.area():
+        raise UserError(
+            f"{view.photo.path}: the correction for a tool {height or 0:g} mm high leaves less "
+            "than half of its silhouette: give its true height with --height_mm, or take the "
+            "photo from straight above"
+        )
+    return pieces[0]
 
 
-def _perimeter(area: CrossSection) -> float:
-    loops = [np.asarray(loop) for loop in area.to_polygons()]
-    return sum(
-        float(np.linalg.norm(loop - np.roll(loop, 1, axis=0), axis=1).sum()) for loop in loops
+def _is_ground(region: CrossSection, views: Sequence[View]) -> bool:
+    """Whether a region, in the first photo's frame, is equally bright in all photos, and not
+    darker than a shadow. Photos that do not show it do not count."""
+    cv2 = import_extra("cv2", purpose="hkd trace", extra="camera")
+    light = np.array(
+        [
+            lightness_in(cv2, view.seen, view.lightness, region.transform(_inverse(view.turn)))
+            for view in views
+        ]
     )
+    light = light[np.isfinite(light)]
+    return len(light) > 1 and float(np.ptp(light)) < _ALIKE and float(light.min()) > -_NO_SHADOW
+
+
+def _inverse(turn: Array) -> Array:
+    back = turn[:, :2].T
+    return np.column_stack([back, -back @ turn[:, 2]])
+
+
+def _opened(area: CrossSection) -> CrossSection:
+    """The parts of an area that are wider than twice `_SLACK_MM`."""
+    return area.offset(-_SLACK_MM, JoinType.Round).offset(_SLACK_MM, JoinType.Round)
+
+
+def unexplained(
+    outlines: Sequence[CrossSection],
+    heights: Sequence[float | None],
+    view: View,
+    edges: str,
+) -> CrossSection:
+    """The part of a photo's silhouettes that tools with these outlines and heights would not
+    hide."""
+    hidden = [
+        silhouette_of_outline(outline, view.camera, height or 0.0, edges)
+        for outline, height in zip(outlines, heights, strict=True)
+    ]
+    return _opened(view.silhouette - CrossSection.batch_boolean(hidden, OpType.Add))

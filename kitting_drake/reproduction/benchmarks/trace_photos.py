@@ -335,11 +335,13 @@ def _skin(
     )
     colour *= np.clip(1 + 0.25 * streaks / streaks.std(), 0.2, 2)[..., None]
     # Draw a few bright bands, in which metal mirrors a lamp. They move with the camera.
-    if spec.shot:
-        rng = np.random.default_rng([spec.seed, spec.shot, 1])
+    moved = np.random.default_rng([spec.seed, spec.shot, 1])
     for _ in range(2):
-        where, wide = rng.uniform(x_low, x_high), rng.uniform(2, 6)
-        shine = rng.uniform(0.2, 1.0) * np.exp(-(((along - where) / wide) ** 2))
+        band = [rng.uniform(x_low, x_high), rng.uniform(2, 6), rng.uniform(0.2, 1.0)]
+        if spec.shot:
+            band = moved.uniform((x_low, 2, 0.2), (x_high, 6, 1.0)).tolist()
+        where, wide, strength = band
+        shine = strength * np.exp(-(((along - where) / wide) ** 2))
         metal = np.array(["steel" in name for name in tool.paints])[np.where(along > middle, 0, 1)]
         colour += (shine * np.where(metal, 1.0, 0.1))[None, :, None].astype(np.float32)
     return (255 * np.sqrt(np.clip(colour, 0, 1))).astype(np.uint8)

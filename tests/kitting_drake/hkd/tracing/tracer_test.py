@@ -82,9 +82,8 @@ def test_an_oblique_photo_gives_the_true_outline(
         drawing = read_drawing(tool.svg.with_suffix(suffix)).outline
         assert drawing.area() == pytest.approx(tool.outline.area(), rel=1e-3)
     assert (path.parent / "out/trace.png").stat().st_size > 10_000
-    assert json.loads((path.parent / "out/trace.json").read_text())["tilt_deg"] == pytest.approx(
-        tilt, abs=1.0
-    )
+    (photo,) = json.loads((path.parent / "out/trace.json").read_text())["photos"]
+    assert photo["tilt_deg"] == pytest.approx(tilt, abs=1.0)
 
 
 @pytest.mark.slow
