@@ -65,7 +65,7 @@ Kit:
     tools: [{tools}]
     tries: 2
     kit: {kit}
-  # The pads reach below the middle of thick round handles, which would else be squeezed out of the jaws.
+  # The pads reach below the middle of thick round handles, so that these are not squeezed out.
   planner: {{grasp_depth_share: 0.6, max_grasp_depth: 0.025}}
   policy: !Learned {{recover: true}}
 {robot}"""
