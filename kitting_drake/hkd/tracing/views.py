@@ -35,8 +35,8 @@ _SLACK_MM = 0.4
 twice this, in mm."""
 _OVERLAP = 0.3
 """Outlines from two photos belong to one tool if they overlap by this share of the smaller one."""
-_SAME_TOOL = 0.4
-"""The least `_agreement` of a tool's outlines from two photos."""
+_SAME_TOOL = 0.5
+"""The least area that a tool's outlines from two photos share, relative to the smaller one."""
 _ALIKE = 0.15
 """The largest difference between the brightness of the ground in two photos, in logarithms of
 light."""
@@ -293,7 +293,8 @@ def _outlines(
     found = [outline_of_silhouette(part, views[0].camera, height, edges)]
     for view in views[1:]:
         found.append(_same_tool(found[0], view, height, edges))
-        if _agreement(found[0], found[-1]) < _SAME_TOOL:
+        common = (found[0] ^ found[-1]).area()
+        if common < _SAME_TOOL * min(found[0].area(), found[-1].area()) or not common:
             x_low, y_low, x_high, y_high = part.bounds()
             raise UserError(
                 f"{view.photo.path} does not show the tool that {views[0].photo.path} shows at "
