@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from manifold3d import CrossSection
 
-from kitting_drake.hkd.tracing.views import outline_of_silhouette
+from kitting_drake.hkd.tracing.views import outline_of_silhouette, silhouette_of_outline
 
 CAMERA = np.array([-60.0, 20.0, 400.0])
 
@@ -23,7 +23,13 @@ def silhouette(outline: CrossSection, heights: np.ndarray) -> CrossSection:
 )
 def test_the_outline_is_found_again(edges: str, heights: np.ndarray):
     outline = CrossSection.square((80, 30)) - CrossSection.circle(8).translate((20, 15))
-    found = outline_of_silhouette(silhouette(outline, heights), CAMERA, 20.0, edges)
+    seen = silhouette(outline, heights)
+    found = outline_of_silhouette(seen, CAMERA, 20.0, edges)
     assert found.num_contour() == 2
-    wrong = (found - outline).area() + (outline - found).area()
-    assert wrong < 0.02 * outline.area()
+    assert difference(found, outline) < 0.02 * outline.area()
+    hidden = silhouette_of_outline(outline, CAMERA, 20.0, edges)
+    assert difference(hidden, seen) < 0.02 * seen.area()
+
+
+def difference(area: CrossSection, other: CrossSection) -> float:
+    return (area - other).area() + (other - area).area()
