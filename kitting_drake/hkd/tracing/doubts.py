@@ -10,8 +10,8 @@ from manifold3d import CrossSection, FillRule, JoinType, OpType
 from numpy.typing import NDArray
 
 from kitting_drake.common.errors import UserError
+from kitting_drake.hkd.tracing.photo_views import EDGES, PhotoView, at_scales, unexplained
 from kitting_drake.hkd.tracing.silhouettes import Unclear
-from kitting_drake.hkd.tracing.views import EDGES, View, at_scales, unexplained
 
 _KINDS = ("add", "remove", "sheet")
 _DOUBTED_MM = 0.12
@@ -110,7 +110,7 @@ def doubts_of(
     parts: Sequence[CrossSection],
     outlines: Sequence[CrossSection],
     heights: Sequence[float | None],
-    views: Sequence[View],
+    views: Sequence[PhotoView],
     edges: str,
     corrections: Corrections,
 ) -> list[tuple[Unclear, ...]]:
@@ -156,7 +156,7 @@ def doubts_of(
     return result
 
 
-def _unsettled(views: Sequence[View], height: float) -> list[Unclear]:
+def _unsettled(views: Sequence[PhotoView], height: float) -> list[Unclear]:
     """Returns the unclear regions of all photos, without those near which some photo has none.
 
     A region at an unknown height, up to `height` in mm, may be anywhere on a strip of the plane.

@@ -4,7 +4,7 @@
 2. The photo is rectified (`plane_view`).
 3. Tools are separated from the ground and from shadows (`tool_mask`).
 4. Their border is found to a fraction of a pixel (`silhouettes`).
-5. The silhouettes of one or several photos are corrected for the tool's height (`views`).
+5. The silhouettes of one or several photos are corrected for the tool's height (`photo_views`).
 """
 
 import math
@@ -22,17 +22,17 @@ from kitting_drake.common.extras import import_extra
 from kitting_drake.common.files import require_folder, write_atomically, write_json
 from kitting_drake.hkd.tracing.doubts import Corrections, doubts_of, read_corrections
 from kitting_drake.hkd.tracing.photo_file import Photo, read_photo
+from kitting_drake.hkd.tracing.photo_views import (
+    PhotoView,
+    aligned,
+    height_in_views,
+    outlines_in_views,
+)
 from kitting_drake.hkd.tracing.plane_view import RectifiedPhoto, rectify
 from kitting_drake.hkd.tracing.scales import Scale, plane_of_scale
 from kitting_drake.hkd.tracing.sheet_plane import GroundPlane, plane_of_sheet
 from kitting_drake.hkd.tracing.silhouettes import Unclear, find_silhouettes
 from kitting_drake.hkd.tracing.trace_files import outlines_dxf, outlines_svg, trace_png
-from kitting_drake.hkd.tracing.views import (
-    View,
-    aligned,
-    height_in_views,
-    outlines_in_views,
-)
 
 _STEEPEST = math.radians(30)
 """The largest accepted angle between the camera's optical axis and the vertical, in radians."""
@@ -61,7 +61,7 @@ class TraceRequest:
     """The tools' heights, from left to right, or one height for all tools. Empty: no correction if
     there is one photo; else the heights are found from the photos."""
     edges: str = "upright"
-    """One of `views.EDGES`."""
+    """One of `photo_views.EDGES`."""
     camera_mm: float | None = None
     """The camera's height above the plane. None: computed from the focal length."""
     points: Path | None = None
@@ -189,7 +189,7 @@ def _check_view(photo: Photo, plane: GroundPlane) -> None:
 
 def _look(
     cv2: Any, request: TraceRequest, path: Path, corners: NDArray[np.float64] | None = None
-) -> View:
+) -> PhotoView:
     """Finds the silhouettes of the tools in one photo, in the frame of its own plane.
 
     Raises:
@@ -214,7 +214,9 @@ def _look(
             f"{path} is blurred: edges are {blur:.1f} mm wide; take it again, with more light or a "
             "steadier hand"
         )
-    return View(photo, plane, seen, found.lightness, found.area, found.unclear, plane.view.camera)
+    return PhotoView(
+        photo, plane, seen, found.lightness, found.area, found.unclear, plane.view.camera
+    )
 
 
 def _rectified(cv2: Any, plane: GroundPlane) -> RectifiedPhoto:
@@ -229,7 +231,7 @@ def _rectified(cv2: Any, plane: GroundPlane) -> RectifiedPhoto:
     return rectify(cv2, plane.pixels, plane.view, low, high, px_per_mm)
 
 
-def _check_edges(view: View) -> None:
+def _check_edges(view: PhotoView) -> None:
     """Raises a UserError if a photo does not show a whole tool."""
     path, seen = view.photo.path, view.seen
     for loop in view.silhouette.to_polygons():
@@ -244,7 +246,7 @@ def _check_edges(view: View) -> None:
 
 
 def _heights(
-    request: TraceRequest, parts: list[CrossSection], views: list[View]
+    request: TraceRequest, parts: list[CrossSection], views: list[PhotoView]
 ) -> list[float | None]:
     given = request.heights_mm
     if not given:
@@ -261,7 +263,9 @@ def _heights(
     return [*given]
 
 
-def _view_notes(views: list[View], request: TraceRequest, tools: list[TracedTool]) -> list[str]:
+def _view_notes(
+    views: list[PhotoView], request: TraceRequest, tools: list[TracedTool]
+) -> list[str]:
     where = "; ".join(
         f"the camera is {view.camera[2]:.0f} mm above the ground, tilted by "
         f"{math.degrees(view.plane.view.tilt):.0f} degrees"
@@ -279,7 +283,11 @@ def _view_notes(views: list[View], request: TraceRequest, tools: list[TracedTool
 
 
 def _write(
-    cv2: Any, request: TraceRequest, tools: list[TracedTool], notes: list[str], views: list[View]
+    cv2: Any,
+    request: TraceRequest,
+    tools: list[TracedTool],
+    notes: list[str],
+    views: list[PhotoView],
 ) -> None:
     outlines = {tool.name: tool.outline for tool in tools}
     files: dict[str, str | bytes] = {}

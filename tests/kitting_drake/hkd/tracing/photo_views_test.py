@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from manifold3d import CrossSection
 
-from kitting_drake.hkd.tracing.views import outline_of_silhouette, silhouette_of_outline
+from kitting_drake.hkd.tracing.photo_views import outline_of_silhouette, silhouette_of_outline
 
 CAMERA = np.array([-60.0, 20.0, 400.0])
 

@@ -57,7 +57,7 @@ _CLEARLY = 1.15
 
 
 @dataclass(frozen=True)
-class View:
+class PhotoView:
     """What one photo shows of the tools."""
 
     photo: Photo
@@ -130,7 +130,7 @@ def at_scales(
     return [centred.scale((scale, scale)).translate(below) for scale in scales]
 
 
-def aligned(view: View, first: View) -> View:
+def aligned(view: PhotoView, first: PhotoView) -> PhotoView:
     """Returns a view in the frame of the first view, which has the same sheet.
 
     The sheets' frames differ by a multiple of a quarter turn about the sheet's middle. It is chosen
@@ -180,7 +180,7 @@ def aligned(view: View, first: View) -> View:
     return moved[int(np.argmax(alike))]
 
 
-def _moved(view: View, turn: Array) -> View:
+def _moved(view: PhotoView, turn: Array) -> PhotoView:
     """Returns a view after a rigid motion (2, 3) of its plane's frame."""
     return replace(
         view,
@@ -197,7 +197,7 @@ def _agreement(outline: CrossSection, other: CrossSection) -> float:
     return (outline ^ other).area() / whole if whole else 0.0
 
 
-def _same_tool(outline: CrossSection, view: View, height: float, edges: str) -> CrossSection:
+def _same_tool(outline: CrossSection, view: PhotoView, height: float, edges: str) -> CrossSection:
     """The outline of a tool from another photo: of the silhouettes there that, at a height, overlap
     the tool's outline from the first photo."""
     found = [CrossSection()]
@@ -208,7 +208,7 @@ def _same_tool(outline: CrossSection, view: View, height: float, edges: str) -> 
     return CrossSection.batch_boolean(found, OpType.Add)
 
 
-def height_in_views(part: CrossSection, views: Sequence[View], edges: str) -> float:
+def height_in_views(part: CrossSection, views: Sequence[PhotoView], edges: str) -> float:
     """Finds a tool's height, in mm, at which the outlines from all photos agree best.
 
     Args:
@@ -247,7 +247,7 @@ def height_in_views(part: CrossSection, views: Sequence[View], edges: str) -> fl
 
 def outlines_in_views(
     parts: Sequence[CrossSection],
-    views: Sequence[View],
+    views: Sequence[PhotoView],
     heights: Sequence[float | None],
     edges: str,
 ) -> list[CrossSection]:
@@ -280,7 +280,7 @@ def outlines_in_views(
 
 
 def _outlines(
-    part: CrossSection, views: Sequence[View], height: float, edges: str
+    part: CrossSection, views: Sequence[PhotoView], height: float, edges: str
 ) -> list[CrossSection]:
     """Returns a tool's outline from each photo."""
     for view in views:
@@ -308,7 +308,7 @@ def _outlines(
 def _with_needed(
     outlines: Sequence[CrossSection],
     from_views: Sequence[Sequence[CrossSection]],
-    views: Sequence[View],
+    views: Sequence[PhotoView],
     heights: Sequence[float | None],
     edges: str,
 ) -> list[CrossSection]:
@@ -332,7 +332,7 @@ def _one_piece(
     outline: CrossSection,
     first: CrossSection,
     part: CrossSection,
-    view: View,
+    view: PhotoView,
     height: float | None,
 ) -> CrossSection:
     """Returns the piece of an outline that overlaps the outline from the first photo most."""
@@ -346,7 +346,7 @@ def _one_piece(
     return pieces[0]
 
 
-def _is_ground(region: CrossSection, views: Sequence[View]) -> bool:
+def _is_ground(region: CrossSection, views: Sequence[PhotoView]) -> bool:
     """Whether a region, in the first photo's frame, is equally bright in all photos, and not
     darker than a shadow. Photos that do not show it do not count."""
     cv2 = import_extra("cv2", purpose="hkd trace", extra="camera")
@@ -373,7 +373,7 @@ def _opened(area: CrossSection) -> CrossSection:
 def unexplained(
     outlines: Sequence[CrossSection],
     heights: Sequence[float | None],
-    view: View,
+    view: PhotoView,
     edges: str,
 ) -> CrossSection:
     """The part of a photo's silhouettes that tools with these outlines and heights would not
