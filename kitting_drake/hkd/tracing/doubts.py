@@ -32,8 +32,8 @@ class Corrections:
     """The polygons, in the order in which they are applied. Each has a kind, `add` or `remove`, and
     points (n, 2) in mm, as on the rulers of `trace.png`."""
     corners: NDArray[np.float64] | None = None
-    """The sheet's corners (4, 2) in pixels of the photo, counter-clockwise in the picture. None:
-    the corners are found automatically."""
+    """The sheet's corners (4, 2) in pixels of the first photo, counter-clockwise in the picture.
+    None: the corners are found automatically."""
 
     def settles(self, place: tuple[float, float]) -> bool:
         """Whether the user has checked a place (x, y), in mm: whether a polygon covers it."""
