@@ -30,6 +30,7 @@ from kitting_drake.reproduction.paper.efficiency import read_efficiency
 from kitting_drake.reproduction.paper.learning_rates import read_rates
 from kitting_drake.reproduction.paper.paper_figures import draw_figure_6, draw_table_1
 from kitting_drake.reproduction.paper.paper_sections import (
+    flat_shapes_table,
     fresh_tools,
     has_figure,
     has_table_1,
@@ -70,6 +71,7 @@ def main() -> int:
     if robustness.exists():
         page = with_figures(robustness.read_text(), robustness_table(others))
         page = with_figures(page, harder_scenes_table(others), "harder scenes")
+        page = with_figures(page, flat_shapes_table(answers), "flat shapes")
         write_atomically(robustness, page)
     Console(quiet=arguments.quiet).print(
         f"{len(runs)} runs: {output}", highlight=False, markup=False

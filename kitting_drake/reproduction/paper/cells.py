@@ -1,4 +1,5 @@
-"""The cells of the paper's tables: how each is trained and evaluated, and which runs count."""
+"""The cells of the paper's tables, and of tables of our own: how each is trained and evaluated, and
+which runs count."""
 
 from __future__ import annotations
 
@@ -41,7 +42,7 @@ class Task:
     """The name of the scenario of the demonstrations."""
     first_seed: int
     table: str = "6"
-    """The table to which the task belongs: `6` (figure 6), `I` (table I) or `fresh`."""
+    """The table to which the task belongs: `6` (figure 6), `I` (table I), `fresh` or `shapes`."""
     episodes: int = 100
     steps: int = 1500
     more_steps: int = 0
@@ -82,6 +83,17 @@ TASKS = {
             "KittingUnseenToolsetsTraining",
             first_seed=3400,
             table="fresh",
+        ),
+        Task(
+            "assembling_kits",
+            "assembling_kits.yaml",
+            "Test",
+            "Train",
+            first_seed=3600,
+            table="shapes",
+            episodes=25,
+            steps=600,
+            validation=12,
         ),
         *(
             Task(
@@ -353,8 +365,8 @@ class Cell:
             wanted["learning_rate"] = training.learning_rate
         elif training.method == "so2":
             wanted["learning_rate"] = LEARNING_RATES[0]
-        if learned_at.table == "6":
-            # For tasks of the other tables, the task determines these two fields.
+        if learned_at.table != "I":
+            # For tasks of table I, the task determines these two fields.
             wanted |= {"taken_only": training.taken_only, "rigid": training.rigid}
         return wanted
 

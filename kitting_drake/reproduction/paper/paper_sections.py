@@ -27,10 +27,18 @@ from kitting_drake.reproduction.paper.paper_tables import (
     DEMONSTRATIONS,
     RAVENS_DEMONSTRATIONS,
     SHIPPED,
+    flat_shapes,
     paper_cells,
 )
 from kitting_drake.reproduction.paper.parameter_table import parameters_section
 
+_MEASURES = {
+    "strict": "strict",
+    "ravens": "Ravens: 10 mm, 15 degrees",
+    "maniskill": "ManiSkill: 20 mm, 4 degrees, height 3 mm",
+    "add_s": "ADD-S",
+}
+"""The headings of the measures of success on flat shapes."""
 COLUMNS = tuple(sorted(ORIENTATIONS))
 _HEADINGS = {"seen": "Seen toolset, figure 6(a)", "unseen": "Unseen toolsets, figure 6(b)"}
 _TITLES = {"seen": "kitting-seen-toolset", "unseen": "kitting-unseen-toolsets"}
@@ -190,6 +198,28 @@ def fresh_tools(results: Sequence[Result], again: Collection[str] = ()) -> list[
             ["policy", "strict success, %", "interval over tools", "paper's measure, %"], rows
         ),
     ]
+
+
+def flat_shapes_table(results: Sequence[Result]) -> str:
+    """Writes the table of `docs/robustness.md` on flat shapes: success by four measures, for each
+    policy and number of demonstrations. Without results it is a sentence that says so.
+
+    Args:
+        results: the results from `cell_results`.
+    """
+    found = {result.cell.name: result.summary for result in results}
+    rows, is_empty = [], True
+    for policy, cells in flat_shapes().items():
+        for cell in cells:
+            texts = ["-"] * len(_MEASURES)
+            if cell.name in found:
+                rates, is_empty = found[cell.name]["measures"], False
+                texts = [rate_text(rates[m]["success_rate"], rates[m]["ci95"]) for m in _MEASURES]
+            count = cell.policy.demonstrations if isinstance(cell.policy, Training) else ""
+            rows.append([policy, str(count), *texts])
+    if is_empty:
+        return "No runs yet.\n"
+    return markdown_table(["policy", "demonstrations", *_MEASURES.values()], rows)
 
 
 def both_rates(result: Result) -> list[str]:

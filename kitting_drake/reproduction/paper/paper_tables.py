@@ -1,4 +1,5 @@
-"""Lists the cells of the paper's tables (figure 6, table I), of our ablation and of fresh tools."""
+"""Lists the cells of the paper's tables (figure 6, table I), and of our own: the ablation, fresh
+tools and flat shapes."""
 
 from __future__ import annotations
 
@@ -8,7 +9,7 @@ from fnmatch import fnmatch
 from typing import Any
 
 from kitting_drake.common.errors import UserError
-from kitting_drake.reproduction.page.runs import LEARNED
+from kitting_drake.reproduction.page.runs import LEARNED, METHODS
 from kitting_drake.reproduction.paper.cells import ORIENTATIONS, TASKS, Cell, Training
 
 DEMONSTRATIONS = (100, 10)
@@ -216,19 +217,24 @@ def _table_1() -> list[Cell]:
         for task in tasks
     ]
     ours = [
-        dataclasses.replace(
-            cell,
-            label=f"{cell.label}_ours".strip("_"),
-            continuous=True,
-            fit_outlines=True,
-            avoid_failed_picks=True,
-        )
+        _with_extensions(cell)
         for cell in (*as_published, *_patient())
         if cell.task in BEYOND_OF_TABLE_1
         and isinstance(cell.policy, Training)
         and cell.policy.method == "so2"
     ]
     return [*as_published, *ours]
+
+
+def _with_extensions(cell: Cell) -> Cell:
+    """Returns the cell of the same networks whose actions are refined, which the paper does not."""
+    return dataclasses.replace(
+        cell,
+        label=f"{cell.label}_ours".strip("_"),
+        continuous=True,
+        fit_outlines=True,
+        avoid_failed_picks=True,
+    )
 
 
 SHIPPED = {
@@ -246,6 +252,21 @@ def _fresh_tools() -> list[Cell]:
     return [Cell("fresh", policy, None, label, search=True) for label, policy in SHIPPED.items()]
 
 
+def flat_shapes() -> dict[str, list[Cell]]:
+    """Returns the cells on flat shapes that no policy has seen (`!AssemblingKits`), by the policy's
+    name."""
+    task = "assembling_kits"
+    learned = {
+        method: [_paper_cell(task, method, n, count) for count in sorted(RAVENS_DEMONSTRATIONS)]
+        for method, n in zip(LEARNED, (180, 36, 36), strict=True)
+    }
+    found = {METHODS[method]: cells for method, cells in learned.items()}
+    found[f"{METHODS['so2']}, with extensions"] = [_with_extensions(c) for c in learned["so2"]]
+    for label in ("shape_matching", "generalist"):
+        found[METHODS[label]] = [Cell(task, SHIPPED[label], None, label, search=True)]
+    return found
+
+
 def paper_cells() -> list[Cell]:
     """Returns all cells, in order of importance."""
     return [
@@ -260,6 +281,7 @@ def paper_cells() -> list[Cell]:
         *_ablation()[4:],
         *_table_1(),
         *_every_chance(),
+        *(cell for cells in flat_shapes().values() for cell in cells),
     ]
 
 
