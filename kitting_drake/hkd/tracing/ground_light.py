@@ -1,4 +1,5 @@
-"""Evens out the light on a plain ground, so that the objects on it stand out."""
+"""Evens out the light on a plain ground, so that the objects on it stand out, and measures what is
+left."""
 
 from typing import Any
 
@@ -13,6 +14,7 @@ _FLOOR = 0.012
 """A value added to linear light before the logarithm, so that noise in dark areas stays small."""
 _SMOOTH_MM = 20.0
 _FIT_POINTS = 20_000
+_MOST_FINE = 0.1
 
 
 def log_light(pixels: Array) -> Array:
@@ -66,6 +68,33 @@ def flattened(cv2: Any, logs: Array, ground: Array, px_per_mm: float) -> tuple[A
         rest = cv2.GaussianBlur(part, (0, 0), sigma) / np.maximum(weight, 1e-3)
         ratio[..., k] -= cv2.resize(rest, (columns, rows), interpolation=cv2.INTER_LINEAR)
     return ratio, spread
+
+
+def lightness_and_colour(cv2: Any, logs: Array) -> tuple[Array, Array]:
+    """Returns two values for each pixel: the mean of its three logarithms, and the largest
+    deviation of a logarithm from this mean."""
+    lightness = cv2.transform(logs, np.full((1, 3), 1 / 3, np.float32))
+    colour = np.zeros_like(lightness)
+    for k in range(3):
+        colour = np.maximum(colour, np.abs(logs[..., k] - lightness))
+    return lightness, colour
+
+
+def steepness(cv2: Any, smooth: Array, px_per_mm: float) -> Array:
+    """Returns (rows, columns): at each pixel, the largest slope of the three channels, per mm."""
+    steep = np.zeros(smooth.shape[:2], np.float32)
+    for k in range(3):
+        x = cv2.Sobel(smooth[..., k], cv2.CV_32F, 1, 0, scale=px_per_mm / 8)
+        y = cv2.Sobel(smooth[..., k], cv2.CV_32F, 0, 1, scale=px_per_mm / 8)
+        steep = np.maximum(steep, cv2.magnitude(x, y))
+    return steep
+
+
+def roughness(cv2: Any, light: Array, even: Array, px_per_mm: float) -> Array:
+    """Returns the local root mean square (rows, columns) of the differences from a smoothed
+    picture."""
+    fine = np.clip(light - even, -_MOST_FINE, _MOST_FINE)
+    return np.sqrt(cv2.GaussianBlur(fine * fine, (0, 0), 0.5 * px_per_mm))
 
 
 def _largest(ratio: Array) -> Array:

@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from kitting_drake.hkd.tracing.ground_light import lightness_and_colour, roughness, steepness
+
 Array = NDArray[Any]
 
 _DARKER, _BRIGHTER, _COLOURED = 0.22, 0.12, 0.11
@@ -19,7 +21,6 @@ _BALL_MM = 0.9
 _ROUGH = 0.022
 """Surfaces less rough than this, in logarithms of light, count as smooth under the limits `MIDDLE`.
 Other limits scale this value."""
-_MOST_FINE = 0.1
 _HOLE_BALL_MM = 0.6
 _STRIP_MM = 1.2
 """In `_shaded_holes`, eroded regions that are at most twice this wide, in mm, are strips."""
@@ -40,6 +41,19 @@ _GLARE_REACH_MM, _GLARE_GAP_MM, _GLARE_MM2, _GLARE_SHARE = 8.0, 2.5, 0.7, 0.25
 """Glare up to `_GLARE_REACH_MM` from a tool is added to the tool. A strip between the two is added
 if it is narrower than twice `_GLARE_GAP_MM`. An added region has an area of at least `_GLARE_MM2`,
 of which at least the share `_GLARE_SHARE` is brighter than the ground."""
+_SOFT_SHARE = 0.3
+_SAME_HUE, _SAME_HUE_TIMES = 0.008, 1.5
+"""A pixel has the hue of the ground if its difference in colour is below `_SAME_HUE`, in logarithms
+of light, or below `_SAME_HUE_TIMES` its median on the ground."""
+_EVEN, _PLAIN = 0.1, 0.04
+"""A bay or hole is ground if its median difference in colour is that small, its median slope is
+below `_EVEN` per mm, and 90 % of it are brighter than the ground by at most `_PLAIN`, both in
+logarithms of light."""
+_PLAIN_MM2, _RIM_MM = 3.0, 0.5
+"""This does not count within `_RIM_MM` of the border, and shows only on at least `_PLAIN_MM2`."""
+_SMOOTH_MM = 1.5
+_SOFT_MM = 3.0
+"""The length, in mm, over which the softness of a border is averaged."""
 _BAY_MM = 12.0
 """Only bays and holes at most twice this wide, in mm, may be reflections."""
 _BLENDED_MM, _SHADED = 1.2, 0.06
@@ -67,7 +81,7 @@ class ShadowLook:
     """The largest ratio of a shadow's roughness to that of the plain ground."""
     shine: float
     """A brightness step is soft if it is wider than this, in mm. A bay or hole is a reflection if
-    at least 30 % of its border with the tool is soft."""
+    at least `_SOFT_SHARE` of its border with the tool is soft."""
 
 
 CAREFUL = ShadowLook(0.3, 2.0, 1.2)
@@ -116,16 +130,18 @@ class ToolMasks:
         self._cv2, self._ground, self._px_per_mm = cv2, ground, px_per_mm
         self._spread = spread
         self._smooth = cv2.GaussianBlur(ratio, (0, 0), 0.12 * px_per_mm + 0.3)
-        self._lightness, self._colour = _lightness_and_colour(cv2, self._smooth)
-        self._steep = _steepness(cv2, self._smooth, px_per_mm)
+        self._lightness, self._colour = lightness_and_colour(cv2, self._smooth)
+        self._steep = steepness(cv2, self._smooth, px_per_mm)
         self._noise = noise = max(1.0, 4 * spread / _DARKER)
         evidence = np.maximum(-self._lightness / _DARKER, self._lightness / _BRIGHTER)
         self._evidence = np.maximum(evidence, self._colour / _COLOURED) / noise
         self._evidence[~ground] = 0
         self._plain = self._evidence < 0.5
+        usual = _median(self._colour[self._plain & ground], 0.0)
+        self._hue_limit = max(_SAME_HUE, _SAME_HUE_TIMES * usual)
         light = cv2.transform(ratio, np.full((1, 3), 1 / 3, np.float32))
         even = cv2.GaussianBlur(light, (0, 0), 0.5 * px_per_mm)
-        self._rough = _roughness(cv2, light, even, px_per_mm)
+        self._rough = roughness(cv2, light, even, px_per_mm)
         self._usual = _median(self._rough[self._plain & ground], _ROUGH)
         # The slope and the width of the steepest brightness step near each pixel.
         self._peak = cv2.dilate(self._steep, _disc(cv2, 0.7 * px_per_mm))
@@ -133,7 +149,7 @@ class ToolMasks:
         span = cv2.dilate(self._lightness, disc) - cv2.erode(self._lightness, disc)
         self._width = span / np.maximum(self._peak, 1e-3)
         # A median filter keeps edges, so they do not count as roughness.
-        self._fine = _roughness(cv2, light, cv2.medianBlur(light, 5), px_per_mm)
+        self._fine = roughness(cv2, light, cv2.medianBlur(light, 5), px_per_mm)
 
     def mask(self, look: ShadowLook) -> Array:
         """Returns a mask (rows, columns): 1 where a tool hides the ground.
@@ -143,10 +159,13 @@ class ToolMasks:
         tools. A watershed moves the border of the tools to the steepest brightness step nearby.
         """
         cv2, ground, px_per_mm, noise = self._cv2, self._ground, self._px_per_mm, self._noise
-        free = (self._steep < look.steep * noise) & (self._colour < _COLOURED * noise)
+        neutral = self._colour < self._hue_limit
+        steepest = np.where(neutral, max(look.steep, BOLD.steep), look.steep).astype(np.float32)
+        free = (self._steep < steepest * noise) & (self._colour < _COLOURED * noise)
         free &= (self._lightness > -_NO_SHADOW) & (self._lightness < _BRIGHTER * noise)
         free |= ~ground
-        roughest = max(_ROUGH * look.rough / 3, look.rough * self._usual)
+        ratio = np.where(neutral, max(look.rough, BOLD.rough), look.rough).astype(np.float32)
+        roughest = ratio * max(_ROUGH / 3, self._usual)
         even = (free & (self._rough < roughest)) | ~ground
         reached = _reached(cv2, even, self._plain, px_per_mm)
         # Every pixel of a small hole is near an edge. So find holes that lie wholly in shadow by a
@@ -214,12 +233,27 @@ class ToolMasks:
         """Fills the bays and holes of a mask that are reflections on a tool.
 
         Their border with the tool is soft, or they are brighter than the ground. A brightness step
-        that is wider than `widest`, in mm, is soft.
+        that is wider than `widest`, in mm, is soft. A reflection may open into a true gap: the part
+        of a bay that is nearest to a soft border is examined on its own.
         """
-        cv2, px_per_mm = self._cv2, self._px_per_mm
-        closed = _closed(cv2, tool, _BAY_MM * px_per_mm, px_per_mm)
+        cv2 = self._cv2
+        closed = _closed(cv2, tool, _BAY_MM * self._px_per_mm, self._px_per_mm)
         rim = (tool > 0) & (cv2.erode(tool, _disc(cv2, 1)) == 0)
         bays = (closed & (tool == 0)).astype(np.uint8)
+        soft = rim & ((self._peak < _SHINE_STEEP) | (self._width > widest))
+        filled = self._filled(tool, bays, rim, soft)
+        if not soft.any():
+            return filled
+        near = bays & ~filled & 1 & _nearest(cv2, soft, rim, self._px_per_mm)
+        near[self._colour < self._hue_limit] = 0
+        both = self._filled(filled, near, rim, soft)
+        disc = _disc(cv2, _SMOOTH_MM * self._px_per_mm)
+        grown = cv2.dilate(both & ~filled & 1, disc)
+        return both | (cv2.morphologyEx(both, cv2.MORPH_CLOSE, disc) & grown & bays)
+
+    def _filled(self, tool: Array, bays: Array, rim: Array, soft: Array) -> Array:
+        """Returns a mask with those regions of `bays` filled that are reflections."""
+        cv2, px_per_mm = self._cv2, self._px_per_mm
         count, labels, stats, _ = cv2.connectedComponentsWithStats(bays, connectivity=4)
         filled = tool.copy()
         for i in range(1, count):
@@ -229,14 +263,26 @@ class ToolMasks:
             box = (slice(max(0, y - 2), y + height + 2), slice(max(0, x - 2), x + width + 2))
             bay = labels[box] == i
             border = (cv2.dilate(bay.astype(np.uint8), _disc(cv2, 1)) > 0) & rim[box]
-            if not border.any():
+            if not border.any() or self._is_plain(box, bay):
                 continue
-            soft = np.median(self._peak[box][border]) < _SHINE_STEEP
-            # Part of a reflection's border may be sharp: it is enough if 30 % is soft.
-            soft |= np.percentile(self._width[box][border], 70) > widest
-            if soft or (self._lightness[box][bay] > _SHINY).mean() > _SHINY_SHARE:
+            bright = (self._lightness[box][bay] > _SHINY).mean() > _SHINY_SHARE
+            # Part of a reflection's border may be sharp.
+            if bright or soft[box][border].mean() > _SOFT_SHARE:
                 filled[box][bay] = 1
         return filled
+
+    def _is_plain(self, box: tuple[slice, slice], region: Array) -> bool:
+        """Whether a region, away from its border, is ground: evenly lit, of the ground's hue, and
+        nowhere brighter than lit ground."""
+        disc = _disc(self._cv2, _RIM_MM * self._px_per_mm)
+        inside = self._cv2.erode(region.astype(np.uint8), disc) > 0
+        if inside.sum() < _PLAIN_MM2 * self._px_per_mm**2:
+            return False
+        return bool(
+            np.median(self._colour[box][inside]) < self._hue_limit
+            and np.median(self._steep[box][inside]) < _EVEN
+            and np.percentile(self._lightness[box][inside], 90) < _PLAIN
+        )
 
     def _bordered(self, tool: Array) -> Array:
         """Moves the border of a mask to the steepest brightness step nearby."""
@@ -256,33 +302,6 @@ class ToolMasks:
 
 def _median(values: Array, otherwise: float) -> float:
     return float(np.median(values)) if values.size else otherwise
-
-
-def _lightness_and_colour(cv2: Any, logs: Array) -> tuple[Array, Array]:
-    """Returns two values for each pixel: the mean of its three logarithms, and the largest
-    deviation of a logarithm from this mean."""
-    lightness = cv2.transform(logs, np.full((1, 3), 1 / 3, np.float32))
-    colour = np.zeros_like(lightness)
-    for k in range(3):
-        colour = np.maximum(colour, np.abs(logs[..., k] - lightness))
-    return lightness, colour
-
-
-def _steepness(cv2: Any, smooth: Array, px_per_mm: float) -> Array:
-    """Returns (rows, columns): at each pixel, the largest slope of the three channels, per mm."""
-    steep = np.zeros(smooth.shape[:2], np.float32)
-    for k in range(3):
-        x = cv2.Sobel(smooth[..., k], cv2.CV_32F, 1, 0, scale=px_per_mm / 8)
-        y = cv2.Sobel(smooth[..., k], cv2.CV_32F, 0, 1, scale=px_per_mm / 8)
-        steep = np.maximum(steep, cv2.magnitude(x, y))
-    return steep
-
-
-def _roughness(cv2: Any, light: Array, even: Array, px_per_mm: float) -> Array:
-    """Returns the local root mean square (rows, columns) of the differences from a smoothed
-    picture."""
-    fine = np.clip(light - even, -_MOST_FINE, _MOST_FINE)
-    return np.sqrt(cv2.GaussianBlur(fine * fine, (0, 0), 0.5 * px_per_mm))
 
 
 def _reached(cv2: Any, even: Array, plain: Array, px_per_mm: float) -> Array:
@@ -318,6 +337,19 @@ def _shaded_holes(cv2: Any, even: Array, like_ground: Array, px_per_mm: float) -
     table &= ~wide | (area < _LARGEST_HOLE_MM2 * px_per_mm**2)
     table[0] = False
     return cv2.dilate(table[labels].astype(np.uint8), disc) > 0
+
+
+def _nearest(cv2: Any, soft: Array, rim: Array, px_per_mm: float) -> Array:
+    """Returns a mask (rows, columns): 1 where the nearest stretch of a rim is mostly soft."""
+    side = 2 * round(_SOFT_MM / 2 * px_per_mm) + 1
+    share = cv2.blur(soft.astype(np.float32), (side, side))
+    mostly = share > 0.5 * cv2.blur(rim.astype(np.float32), (side, side))
+    _, labels = cv2.distanceTransformWithLabels(
+        1 - rim.astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    table = np.zeros(int(labels.max()) + 1, np.uint8)
+    table[labels[rim]] = mostly[rim]
+    return table[labels]
 
 
 def _closed(cv2: Any, mask: Array, radius: float, px_per_mm: float) -> Array:
