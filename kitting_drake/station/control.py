@@ -4,15 +4,17 @@ from dataclasses import dataclass
 
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import ModelInstanceIndex
 from pydrake.systems.framework import DiagramBuilder, InputPort, OutputPort
 from pydrake.systems.primitives import Demultiplexer, Multiplexer
 
 from kitting_drake.scenario.robots import FrankaArm
 from kitting_drake.scenario.schema import Scenario
-from kitting_drake.station.robot import ARM, HAND, HAND_JOINT_NAMES, arm_model
+from kitting_drake.station.robot import ARM, HAND, HAND_JOINT_NAMES, arm_model, hand_model
 from kitting_drake.tasks.task import Scene
 from systems.arm_hand_state import ArmHandState
 from systems.arm_limits import JOINTS
+from systems.contact_torque import ContactTorque
 from systems.heightmap_projector import HeightmapProjector
 from systems.joint_controller import JointController
 from systems.pick_place_planner import PickPlacePlanner
@@ -119,7 +121,10 @@ def _drive_hand(builder: DiagramBuilder, scenario: Scenario, plant: MultibodyPla
     controller = builder.AddNamedSystem("controller", _hand_controller(scenario, plant))
     builder.Connect(state, controller.GetInputPort("hand_state"))
     builder.Connect(controller.get_output_port(), plant.get_actuation_input_port(hand))
-    force = plant.get_generalized_contact_forces_output_port(hand)
+    torque = _add_contact_torque(builder, plant, hand_model(), state, (hand,))
+    force = builder.AddNamedSystem("wrist_force", Multiplexer([len(HAND_JOINT_NAMES), FINGERS]))
+    builder.Connect(torque, force.get_input_port(0))
+    builder.Connect(_finger_force(builder, plant), force.get_input_port(1))
     reactions = plant.get_reaction_forces_output_port()
     yaw = plant.GetJointByName("yaw").index()
     moment = builder.AddNamedSystem(
@@ -130,7 +135,7 @@ def _drive_hand(builder: DiagramBuilder, scenario: Scenario, plant: MultibodyPla
         controller,
         state,
         state,
-        force,
+        force.get_output_port(),
         controller.get_output_port(),
         moment.get_output_port(),
     )
@@ -169,9 +174,9 @@ def drive_arm(
         robot_state,
         *(it.GetInputPort("robot_state") for it in (controller, wrist, hand_state)),
     )
-    for instance, port in ((arm, "joint_contact_torque"), (hand, "finger_contact_force")):
-        force = plant.get_generalized_contact_forces_output_port(instance)
-        connect(force, wrist.GetInputPort(port))
+    torque = _add_contact_torque(builder, plant, model, robot_state, (arm, hand))
+    connect(torque, wrist.GetInputPort("joint_contact_torque"))
+    connect(_finger_force(builder, plant), wrist.GetInputPort("finger_contact_force"))
     connect(controller.GetOutputPort("desired_state"), plant.get_desired_state_input_port(arm))
     connect(controller.GetOutputPort("feedforward"), plant.get_actuation_input_port(arm))
     connect(plant.get_net_actuation_output_port(arm), actuation.get_input_port(0))
@@ -188,6 +193,53 @@ def drive_arm(
         actuation.get_output_port(),
         wrist.GetOutputPort("wrist_moment"),
     )
+
+
+def _add_contact_torque(
+    builder: DiagramBuilder,
+    plant: MultibodyPlant,
+    robot: MultibodyPlant,
+    state: OutputPort,
+    instances: tuple[ModelInstanceIndex, ...],
+) -> OutputPort:
+    """Adds the computation of the contact forces that a robot's joints feel, except for the
+    fingers; returns their port.
+
+    Args:
+        builder: the builder of the station.
+        plant: the station's plant.
+        robot: a plant that contains only the robot.
+        state: the robot's state.
+        instances: the robot's model instances in the station's plant, in the order of its joints.
+    """
+    system = builder.AddNamedSystem(
+        "contact_torque",
+        ContactTorque(robot=robot, joints=robot.num_velocities() - FINGERS, step=plant.time_step()),
+    )
+    builder.Connect(state, system.GetInputPort("robot_state"))
+    for name, port_of in (
+        ("acceleration", plant.get_generalized_acceleration_output_port),
+        ("actuation", plant.get_net_actuation_output_port),
+    ):
+        ports = [port_of(instance) for instance in instances]
+        joined = builder.AddNamedSystem(f"robot_{name}", Multiplexer([it.size() for it in ports]))
+        for number, port in enumerate(ports):
+            builder.Connect(port, joined.get_input_port(number))
+        builder.Connect(joined.get_output_port(), system.GetInputPort(name))
+    return system.get_output_port()
+
+
+def _finger_force(builder: DiagramBuilder, plant: MultibodyPlant) -> OutputPort:
+    """Returns the port of the contact forces on the fingers' joints. A coupler makes the fingers
+    move alike, so their motion does not tell the forces on each of them."""
+    force = plant.get_generalized_contact_forces_output_port(plant.GetModelInstanceByName(HAND))
+    if force.size() == FINGERS:
+        return force
+    parts = builder.AddNamedSystem(
+        "hand_contact_force", Demultiplexer([force.size() - FINGERS, FINGERS])
+    )
+    builder.Connect(force, parts.get_input_port())
+    return parts.get_output_port(1)
 
 
 def _robot_state(builder: DiagramBuilder, plant: MultibodyPlant) -> OutputPort:

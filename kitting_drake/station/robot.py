@@ -82,6 +82,14 @@ def arm_model(robot: FrankaArm) -> tuple[MultibodyPlant, Frame]:
     return plant, plant.GetFrameByName(GRIPPER)
 
 
+def hand_model() -> MultibodyPlant:
+    """Makes a plant that contains only the floating hand."""
+    plant = MultibodyPlant(time_step=0.0)
+    _parser(plant).AddModelsFromString(_text(MODELS / HAND / f"{HAND}.sdf"), "sdf")
+    plant.Finalize()
+    return plant
+
+
 def make_motion(scenario: Scenario) -> RobotMotion:
     """Makes the object that computes the motions of the robot.
 
