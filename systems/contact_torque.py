@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import JointIndex, MultibodyForces
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
@@ -34,9 +33,10 @@ class ContactTorque(LeafSystem):
       h of a step. Before the first step, tau_c is zero.
 
     A robot's controller estimates external torques in this way. The plant's own port of contact
-    forces is not used: with the contact approximation `lagged` it may report friction that does not
-    fit the motion. For example, it reported a lateral force of 30 N between the hand and a tool of
-    145 g that the hand carried, where the tool's acceleration needs 1 N.
+    forces is not used, because it sometimes reports friction that does not fit the motion. Forces
+    of joint limits count as contact forces.
+
+    Acceleration and actuation must come from the plant's sampled ports, the default of Drake.
 
     Stateless.
     """
@@ -75,20 +75,11 @@ class ContactTorque(LeafSystem):
             output.SetFromVector(np.zeros(self._joints))
             return
         q, v = np.split(self._state.Eval(context), 2)
-        needed = self._needed(q - self._step * v, v - self._step * acceleration, acceleration)
-        # The inverse dynamics have damped the velocities before the step.
-        needed += self._damping * self._step * acceleration
-        output.SetFromVector((needed - actuation)[: self._joints])
-
-    def _needed(
-        self,
-        q: NDArray[np.float64],
-        v: NDArray[np.float64],
-        acceleration: NDArray[np.float64],
-    ) -> NDArray[np.float64]:
-        """The generalized forces for an acceleration, beside gravity and damping."""
         robot, scratch = self._robot, self._scratch
-        robot.SetPositions(scratch, q)
-        robot.SetVelocities(scratch, v)
+        robot.SetPositions(scratch, q - self._step * v)
+        robot.SetVelocities(scratch, v - self._step * acceleration)
         robot.CalcForceElementsContribution(scratch, self._forces)
-        return np.asarray(robot.CalcInverseDynamics(scratch, acceleration, self._forces))
+        needed = robot.CalcInverseDynamics(scratch, acceleration, self._forces)
+        # The plant damps the velocities after the step, and the force elements those before it.
+        needed = needed + self._damping * self._step * acceleration
+        output.SetFromVector((needed - actuation)[: self._joints])

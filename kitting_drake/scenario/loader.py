@@ -220,6 +220,10 @@ def _check_meaning(scenario: Scenario) -> None:
         raise ValueError(
             f"plant.time_step must be from 1e-05 to 0.02, not {scenario.plant.time_step:g}"
         )
+    if not scenario.plant.use_sampled_output_ports:
+        raise ValueError(
+            "plant.use_sampled_output_ports must be true: the robot feels forces by it"
+        )
     steps = (1 / 64) / scenario.plant.time_step
     if abs(steps - round(steps)) > 1e-9 or steps < 1:
         raise ValueError(

@@ -222,6 +222,9 @@ def _add_contact_torque(
         ("actuation", plant.get_net_actuation_output_port),
     ):
         ports = [port_of(instance) for instance in instances]
+        if len(ports) == 1:
+            builder.Connect(ports[0], system.GetInputPort(name))
+            continue
         joined = builder.AddNamedSystem(f"robot_{name}", Multiplexer([it.size() for it in ports]))
         for number, port in enumerate(ports):
             builder.Connect(port, joined.get_input_port(number))

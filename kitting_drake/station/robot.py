@@ -71,10 +71,12 @@ def add_robot(plant: MultibodyPlant, robot: Robot) -> None:
 
 
 def arm_model(robot: FrankaArm) -> tuple[MultibodyPlant, Frame]:
-    """Makes a plant that contains only the arm and its hand, without gravity. Returns it and its
-    gripper frame G."""
+    """Makes a plant that contains only the arm and its hand, without gravity but with the joints'
+    friction. Returns it and its gripper frame G."""
     plant = MultibodyPlant(time_step=0.0)
     _add_arm(_parser(plant), plant, robot)
+    for name, friction in zip(ARM_JOINT_NAMES, robot.friction, strict=True):
+        plant.GetJointByName(name).set_default_damping_vector([friction])
     hand = plant.GetFrameByName("hand")
     plant.AddFrame(FixedOffsetFrame(GRIPPER, hand, _X_HANDG))
     plant.mutable_gravity_field().set_gravity_vector(np.zeros(3))

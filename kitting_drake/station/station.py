@@ -98,7 +98,8 @@ class KittingStation(Diagram):
     - `hand_state` (12): positions, then velocities, of x, y, z, yaw and both fingers, for any
       robot.
     - `wrist_force` (6): contact forces along x, y, z (N), the moment about z (N m), and the force
-      on each finger (N). For an arm, `WristForce` computes them from its joint torques.
+      on each finger (N). `ContactTorque` computes all but the fingers' forces from the robot's
+      motion, and for an arm `WristForce` then computes the force on the hand.
     - `actuation` (6 or 9): actuation of the joints (N, N m) and of each finger (N). For an arm it
       is that of the last step.
     - `commanded` (12 or 21): desired positions q_d, velocities v_d and accelerations a_d of the

@@ -88,7 +88,8 @@ def find_silhouettes(
         ground &= ~_polygon(cv2, photo, polygon)
     ratio, spread = flattened(cv2, logs, ground, ppm)
     masks = ToolMasks(cv2, ratio, ground, spread, ppm)
-    mask = masks.mask(look_for(height, ppm))
+    look = look_for(height, ppm)
+    mask = masks.mask(look)
     if sheet is not None:
         inner = _polygon(cv2, photo, _rectangle(_RIM_MM + 0.5, sheet - _RIM_MM - 0.5))
         if mask[~inner].any():
@@ -101,7 +102,7 @@ def find_silhouettes(
         return Silhouettes(CrossSection(), 0.0, (), lightness)
     soft = soft_mask(cv2, photo, mask)
     area = cleaned(contours(photo, soft))
-    differ = (mask ^ masks.mask(BOLD)) | masks.shine(mask)
+    differ = (mask ^ masks.mask(BOLD)) | masks.shine(mask) | masks.hidden_by_hue(mask, look)
     unclear = [*_unclear(cv2, photo, differ), *_blended(cv2, photo, masks.blended(mask))]
     unclear.sort(key=lambda item: -item.area)
     return Silhouettes(area, _blur_mm(cv2, soft, mask, ppm), tuple(unclear), lightness)

@@ -41,19 +41,24 @@ _GLARE_REACH_MM, _GLARE_GAP_MM, _GLARE_MM2, _GLARE_SHARE = 8.0, 2.5, 0.7, 0.25
 """Glare up to `_GLARE_REACH_MM` from a tool is added to the tool. A strip between the two is added
 if it is narrower than twice `_GLARE_GAP_MM`. An added region has an area of at least `_GLARE_MM2`,
 of which at least the share `_GLARE_SHARE` is brighter than the ground."""
-_SOFT_SHARE = 0.3
 _SAME_HUE, _SAME_HUE_TIMES = 0.008, 1.5
 """A pixel has the hue of the ground if its difference in colour is below `_SAME_HUE`, in logarithms
 of light, or below `_SAME_HUE_TIMES` its median on the ground."""
 _EVEN, _PLAIN = 0.1, 0.04
-"""A bay or hole is ground if its median difference in colour is that small, its median slope is
-below `_EVEN` per mm, and 90 % of it are brighter than the ground by at most `_PLAIN`, both in
-logarithms of light."""
+"""A bay or hole with the hue of the ground is ground if its median slope is below `_EVEN` per mm,
+and 90 % of its pixels are brighter than lit ground by at most `_PLAIN`, both in logarithms of
+light."""
 _PLAIN_MM2, _RIM_MM = 3.0, 0.5
-"""This does not count within `_RIM_MM` of the border, and shows only on at least `_PLAIN_MM2`."""
+"""Pixels within `_RIM_MM` of the border are ignored. A bay of which less than `_PLAIN_MM2` is left
+does not count as ground."""
+_SOFT_SHARE, _SOFT_MM = 0.3, 3.0
+"""A bay or hole is a reflection if more than `_SOFT_SHARE` of its border is soft. A stretch of
+border is soft if most of it is, over a length of `_SOFT_MM`."""
 _SMOOTH_MM = 1.5
-_SOFT_MM = 3.0
-"""The length, in mm, over which the softness of a border is averaged."""
+"""Notches narrower than twice this, in mm, at the edge of a filled reflection are filled too."""
+_TINTED_MM = 2.0
+"""If the tool within this distance of a shadow has the hue of the ground, the shadow may be a part
+of the tool."""
 _BAY_MM = 12.0
 """Only bays and holes at most twice this wide, in mm, may be reflections."""
 _BLENDED_MM, _SHADED = 1.2, 0.06
@@ -76,12 +81,13 @@ class ShadowLook:
     """The limits that distinguish shadows from tools."""
 
     steep: float
-    """The largest slope of the logarithm of light, per mm, at the edge of a shadow."""
+    """The largest slope of the logarithm of light, per mm, at the edge of a shadow. For pixels with
+    the hue of the ground, it is at least that of `BOLD`."""
     rough: float
-    """The largest ratio of a shadow's roughness to that of the plain ground."""
+    """The largest ratio of a shadow's roughness to that of the plain ground. For pixels with the
+    hue of the ground, it is at least that of `BOLD`."""
     shine: float
-    """A brightness step is soft if it is wider than this, in mm. A bay or hole is a reflection if
-    at least `_SOFT_SHARE` of its border with the tool is soft."""
+    """A brightness step is soft if it is wider than this, in mm, or if its slope is small."""
 
 
 CAREFUL = ShadowLook(0.3, 2.0, 1.2)
@@ -151,15 +157,16 @@ class ToolMasks:
         # A median filter keeps edges, so they do not count as roughness.
         self._fine = roughness(cv2, light, cv2.medianBlur(light, 5), px_per_mm)
 
-    def mask(self, look: ShadowLook) -> Array:
+    def mask(self, look: ShadowLook, *, by_hue: bool = True) -> Array:
         """Returns a mask (rows, columns): 1 where a tool hides the ground.
 
         Pixels that look like the ground are ground. Shadows count as ground, too: these are pixels
-        without colour that no steep brightness step separates from the ground. All other pixels are
-        tools. A watershed moves the border of the tools to the steepest brightness step nearby.
+        without colour that no steep brightness step separates from the ground. With `by_hue`, the
+        step may be steeper where the hue is that of the ground. All other pixels are tools. A
+        watershed moves the border of the tools to the steepest brightness step nearby.
         """
         cv2, ground, px_per_mm, noise = self._cv2, self._ground, self._px_per_mm, self._noise
-        neutral = self._colour < self._hue_limit
+        neutral = (self._colour < self._hue_limit) & by_hue
         steepest = np.where(neutral, max(look.steep, BOLD.steep), look.steep).astype(np.float32)
         free = (self._steep < steepest * noise) & (self._colour < _COLOURED * noise)
         free &= (self._lightness > -_NO_SHADOW) & (self._lightness < _BRIGHTER * noise)
@@ -193,6 +200,15 @@ class ToolMasks:
         near = cv2.dilate(mask, _disc(cv2, _SHINE_REACH_MM * self._px_per_mm))
         bright = (self._lightness > 2 * _SHINY * self._noise) & self._ground
         return ((near > mask) & bright).astype(np.uint8)
+
+    def hidden_by_hue(self, mask: Array, look: ShadowLook) -> Array:
+        """Returns a mask (rows, columns): 1 where only the hue tells shadow from tool, although the
+        tool nearby has the hue of the ground, too."""
+        cv2, px_per_mm = self._cv2, self._px_per_mm
+        neutral = ((mask > 0) & (self._colour < self._hue_limit)).astype(np.uint8)
+        neutral = cv2.morphologyEx(neutral, cv2.MORPH_OPEN, _disc(cv2, _RIM_MM * px_per_mm))
+        near = cv2.dilate(neutral, _disc(cv2, _TINTED_MM * px_per_mm))
+        return near & (mask ^ self.mask(look, by_hue=False))
 
     def blended(self, mask: Array) -> Array:
         """Returns the border pixels of a mask (rows, columns) at which the tool blends into a
@@ -232,8 +248,8 @@ class ToolMasks:
     def _without_shine(self, tool: Array, widest: float) -> Array:
         """Fills the bays and holes of a mask that are reflections on a tool.
 
-        Their border with the tool is soft, or they are brighter than the ground. A brightness step
-        that is wider than `widest`, in mm, is soft. A reflection may open into a true gap: the part
+        Their border with the tool is soft, or they are brighter than the ground, and they are not
+        plain ground. A brightness step that is wider than `widest`, in mm, is soft. A reflection may open into a true gap: the part
         of a bay that is nearest to a soft border is examined on its own.
         """
         cv2 = self._cv2

@@ -96,7 +96,8 @@ def has_table_1(results: Iterable[Result]) -> bool:
 
 def _state_text(results: Sequence[Result], to_run_again: Collection[str]) -> str:
     """Says how many of the cells have been run, and how long that took."""
-    cells = paper_cells()
+    cells = [cell for cell in paper_cells() if TASKS[cell.task].table != "shapes"]
+    results = [result for result in results if TASKS[result.cell.task].table != "shapes"]
     count, again = len(cells), sum(cell.name in to_run_again for cell in cells)
     hours = f"{sum(result.summary['wall_seconds'] for result in results) / 3600:.0f}"
     if len(results) == count:

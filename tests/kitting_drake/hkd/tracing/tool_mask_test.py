@@ -26,11 +26,15 @@ def steel(light: float, contrast: float) -> np.ndarray:
     return (light + contrast * streaks / streaks.std())[..., None] + TINT
 
 
-def mask_of(logs: np.ndarray, look: ShadowLook) -> np.ndarray:
+def masks_of(logs: np.ndarray) -> ToolMasks:
     rng = np.random.default_rng(1)
     picture = cv2.GaussianBlur(logs.astype(np.float32), (0, 0), 1.0)
     picture += rng.normal(scale=0.004, size=SHAPE)[..., None].astype(np.float32)
-    return ToolMasks(cv2, picture, np.ones(SHAPE, bool), 0.004, PX_PER_MM).mask(look)
+    return ToolMasks(cv2, picture, np.ones(SHAPE, bool), 0.004, PX_PER_MM)
+
+
+def mask_of(logs: np.ndarray, look: ShadowLook) -> np.ndarray:
+    return masks_of(logs).mask(look)
 
 
 def test_a_hole_in_pale_steel_is_no_reflection():
@@ -72,3 +76,20 @@ def test_a_sharp_shadow_beside_a_high_tool_is_ground():
     mask = mask_of(logs, CAREFUL)
     assert mask[box(25, 36.5, 45, 4)].mean() < 0.02
     assert mask[box(16, 21, 58, 13)].mean() > 0.98
+
+
+@pytest.mark.parametrize(("tint", "doubtful"), [(0.0, True), (1.0, False)])
+def test_a_soft_edge_is_in_doubt_only_beside_a_tool_of_the_hue_of_the_ground(
+    *, tint: float, doubtful: bool
+):
+    logs = np.zeros((*SHAPE, 3))
+    bar = box(15, 20, 60, 15)
+    logs[bar] = (steel(-1.0, 0.05) - TINT)[bar]
+    # The lower edge is so soft that it looks like a shadow's.
+    soft = np.clip((np.indices(SHAPE)[0] / PX_PER_MM - 32) / 2.2, 0, 1)[bar]
+    logs[bar] *= (1 - soft)[..., None]
+    tinted = box(15, 20, 60, 12)
+    logs[tinted] += tint * TINT
+    masks = masks_of(logs)
+    unsure = masks.hidden_by_hue(masks.mask(CAREFUL), CAREFUL)
+    assert (unsure.sum() / PX_PER_MM**2 > 20) == doubtful
