@@ -11,11 +11,12 @@ from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import SCENARIOS
 from kitting_drake.evaluation.summary import summarise
 from kitting_drake.reproduction.page.runs import Run, described
-from kitting_drake.reproduction.paper.cell_results import cell_results
+from kitting_drake.reproduction.paper.cell_results import Result, cell_results
 from kitting_drake.reproduction.paper.cells import TASKS, Cell, Training
 from kitting_drake.reproduction.paper.learning_rates import RATES, Rates, read_rates
 from kitting_drake.reproduction.paper.paper_figures import draw_figure_6, draw_table_1
 from kitting_drake.reproduction.paper.paper_sections import (
+    flat_shapes_table,
     fresh_tools,
     has_figure,
     has_table_1,
@@ -281,3 +282,22 @@ def test_table_1_is_drawn_from_the_existing_results(runs: tuple[Run, ...]):
     assert drawn != draw_table_1(results)
     assert not has_table_1(results.values())
     assert "results_ravens.png" not in "\n".join(paper_sections(list(results.values())))
+
+
+def test_flat_shapes_show_the_four_measures_of_each_cell():
+    assert flat_shapes_table([]) == "No runs yet.\n"
+    shares = {"strict": 0.5, "ravens": 0.75, "maniskill": 0.6, "add_s": 0.7}
+    measures = {
+        name: {"success_rate": share, "ci95": [share - 0.1, share + 0.1]}
+        for name, share in shares.items()
+    }
+    cell = CELLS["assembling_kits_transporter_36_10"]
+    table = rows(flat_shapes_table([Result(cell, {"measures": measures})]))
+    assert table["Transporter", "10"] == [
+        "50.0 (40.0 to 60.0)",
+        "75.0 (65.0 to 85.0)",
+        "60.0 (50.0 to 70.0)",
+        "70.0 (60.0 to 80.0)",
+    ]
+    assert table["Transporter", "1"] == ["-"] * 4
+    assert table["generalist", ""] == ["-"] * 4
