@@ -249,8 +249,9 @@ class ToolMasks:
         """Fills the bays and holes of a mask that are reflections on a tool.
 
         Their border with the tool is soft, or they are brighter than the ground, and they are not
-        plain ground. A brightness step that is wider than `widest`, in mm, is soft. A reflection may open into a true gap: the part
-        of a bay that is nearest to a soft border is examined on its own.
+        plain ground. A brightness step that is wider than `widest`, in mm, is soft. A reflection
+        may open into a true gap: the part of a bay that is nearest to a soft border is examined on
+        its own.
         """
         cv2 = self._cv2
         closed = _closed(cv2, tool, _BAY_MM * self._px_per_mm, self._px_per_mm)
