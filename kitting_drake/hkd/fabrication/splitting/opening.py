@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 LEAST_WALL = 1.2
 """The least thickness of a wall, in mm: three lines printed with a nozzle of 0.4 mm."""
 
+_SLIVER = 1e-3
+"""Parts thinner than twice this share of the least thickness are errors of rounding."""
 _SHARPEST = math.radians(42)
 """The angle in radians below which a corner counts as a thin wall."""
 
@@ -52,7 +54,10 @@ def corner_area(least: float) -> float:
 def thin_parts(shape: CrossSection, least: float) -> CrossSection:
     """Returns the parts of a shape that are thinner than `least`, and the tips of its corners."""
     inner = shape.offset(-least / 2, JoinType.Round, circular_segments=64)
-    return shape - inner.offset(least / 2, JoinType.Round, circular_segments=64)
+    thin = shape - inner.offset(least / 2, JoinType.Round, circular_segments=64)
+    # The arcs are polygons, so slivers along the edges may join one corner's tip to the next.
+    sliver = _SLIVER * least
+    return thin.offset(-sliver, JoinType.Miter).offset(sliver, JoinType.Miter)
 
 
 def roomiest_point(outline: CrossSection, farthest: float) -> NDArray[np.float64]:
