@@ -32,7 +32,7 @@ def thin(shape: CrossSection) -> list[CrossSection]:
 
 
 FEET_MM = 5.0
-"""The height of Gridfinity feet, in which necks beside a dovetail may be thin (docs/printing.md)."""
+"""The height of Gridfinity feet. A neck beside a dovetail may be thin there (docs/printing.md)."""
 
 
 def check_solid(path: Path, lowest_wall: float = 0.0) -> None:
