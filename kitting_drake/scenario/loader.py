@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from pydrake.common.yaml import yaml_load_typed
+from pydrake.multibody.plant import MultibodyPlantConfig
 
 from kitting_drake.common.errors import UserError
 from kitting_drake.scenario.cameras import check_camera
@@ -208,28 +209,33 @@ def _load(
     return scenario
 
 
-def _check_meaning(scenario: Scenario) -> None:
-    """Checks the constraints that types and ranges cannot express."""
-    approximation = scenario.plant.discrete_contact_approximation
+def _check_plant(plant: MultibodyPlantConfig) -> None:
+    """Checks that the station can simulate a plant with this configuration."""
+    approximation = plant.discrete_contact_approximation
     if approximation not in _APPROXIMATIONS:
         raise ValueError(
             f"plant.discrete_contact_approximation must be {' or '.join(_APPROXIMATIONS)}, "
             f"not '{approximation}'"
         )
-    if not 1e-5 <= scenario.plant.time_step <= 0.02:
+    if not 1e-5 <= plant.time_step <= 0.02:
         raise ValueError(
-            f"plant.time_step must be from 1e-05 to 0.02, not {scenario.plant.time_step:g}"
+            f"plant.time_step must be from 1e-05 to 0.02, not {plant.time_step:g}"
         )
-    if not scenario.plant.use_sampled_output_ports:
+    if not plant.use_sampled_output_ports:
         raise ValueError(
             "plant.use_sampled_output_ports must be true: the robot feels forces by it"
         )
-    steps = (1 / 64) / scenario.plant.time_step
+    steps = (1 / 64) / plant.time_step
     if abs(steps - round(steps)) > 1e-9 or steps < 1:
         raise ValueError(
             "plant.time_step must divide 1/64 s, the planner's period, "
-            f"but is {scenario.plant.time_step:g}"
+            f"but is {plant.time_step:g}"
         )
+
+
+def _check_meaning(scenario: Scenario) -> None:
+    """Checks the constraints that types and ranges cannot express."""
+    _check_plant(scenario.plant)
     if scenario.heightmap.z_min > 0:
         raise ValueError(
             f"heightmap.z_min is {scenario.heightmap.z_min:g}, but the heightmap must include the "
