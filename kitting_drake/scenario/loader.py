@@ -218,9 +218,7 @@ def _check_plant(plant: MultibodyPlantConfig) -> None:
             f"not '{approximation}'"
         )
     if not 1e-5 <= plant.time_step <= 0.02:
-        raise ValueError(
-            f"plant.time_step must be from 1e-05 to 0.02, not {plant.time_step:g}"
-        )
+        raise ValueError(f"plant.time_step must be from 1e-05 to 0.02, not {plant.time_step:g}")
     if not plant.use_sampled_output_ports:
         raise ValueError(
             "plant.use_sampled_output_ports must be true: the robot feels forces by it"
@@ -228,8 +226,7 @@ def _check_plant(plant: MultibodyPlantConfig) -> None:
     steps = (1 / 64) / plant.time_step
     if abs(steps - round(steps)) > 1e-9 or steps < 1:
         raise ValueError(
-            "plant.time_step must divide 1/64 s, the planner's period, "
-            f"but is {plant.time_step:g}"
+            f"plant.time_step must divide 1/64 s, the planner's period, but is {plant.time_step:g}"
         )
 
 
