@@ -30,6 +30,8 @@ class _Row(VectorView):
     aside = Number()
     middle = Array(2)
     """The middle of the picked object, x and y in the world in m; NaN if unknown."""
+    spread = Array(3)
+    """The variances xx, xy and yy of the picked object's points, in m^2; NaN if unknown."""
     outcome = Number()
     """Index of the outcome in `OUTCOMES`."""
     peak_force = Number()
@@ -71,6 +73,7 @@ class AttemptHistory:
         row.pick, row.place = action.pick.as_array(), action.place.as_array()
         row.press, row.aside = action.press, action.aside
         row.middle = (np.nan, np.nan) if action.middle is None else action.middle
+        row.spread = np.nan if action.spread is None else action.spread
         row.balance = (np.nan, np.nan) if balance is None else balance
         row.top = np.nan if top is None else top
         self.amend(outcome, peak_force)
@@ -94,6 +97,7 @@ class AttemptHistory:
                 press=bool(row.press),
                 aside=bool(row.aside),
                 middle=known_point(row.middle),
+                spread=known_spread(row.spread),
             )
             balance = known_point(row.balance)
             outcome, top = OUTCOMES[int(row.outcome)], None if np.isnan(row.top) else row.top
@@ -123,6 +127,12 @@ def known_point(point: NDArray[np.float64]) -> tuple[float, float] | None:
     """Returns a stored point (2); None if it is NaN."""
     x, y = point.tolist()
     return None if np.isnan(x) else (x, y)
+
+
+def known_spread(spread: NDArray[np.float64]) -> tuple[float, float, float] | None:
+    """Returns the stored variances (3) of an object's points; None if they are NaN."""
+    xx, xy, yy = spread.tolist()
+    return None if np.isnan(xx) else (xx, xy, yy)
 
 
 class LeftOverVector:

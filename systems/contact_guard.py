@@ -65,8 +65,8 @@ class ContactGuard:
     hand presses an object down; then `press_force` is the limit.
 
     A peak is the largest mean over 1/64 s, as a wrist sensor would show it. In a shorter time the
-    force of an impact is its impulse divided by the plant's step, and so depends on the step. If
-    the guard acts, the force at that moment counts as well.
+    force of an impact is its impulse divided by the plant's step, and so depends on the step. The
+    guard acts on single samples, so a peak may be below the limit although the guard acted.
     """
 
     def __init__(self, limit: float, step: float) -> None:
@@ -126,10 +126,7 @@ class ContactGuard:
             push = 0.0
         is_beyond = max(push, lateral) > self._limit
         state.beyond = state.beyond + self._step if is_beyond else 0.0
-        must_stop = is_beyond and (mode in _AT_ONCE or state.beyond > _LASTING)
-        if must_stop:
-            self._keep_peaks(state, abs(vertical), lateral)
-        return must_stop
+        return is_beyond and (mode in _AT_ONCE or state.beyond > _LASTING)
 
     def tare(self, state: PlannerState, contact: NDArray[np.float64], threshold: float) -> None:
         """Sets the payload to the vertical force at rest. If this force differs too much from the

@@ -14,7 +14,12 @@ from pydrake.systems.framework import (
     LeafSystem,
 )
 
-from systems.attempt_history import AttemptHistory, LeftOverVector, known_point
+from systems.attempt_history import (
+    AttemptHistory,
+    LeftOverVector,
+    known_point,
+    known_spread,
+)
 from systems.contact_guard import ContactGuard, known_payload
 from systems.floating_hand_motion import HandMotion
 from systems.hand_geometry import check_reach
@@ -339,6 +344,7 @@ class PickPlacePlanner(LeafSystem):
             state.place_hover_z = max(hover, min(hover + _ASIDE, float(state.travel_z)))
         state.search_step, state.press, state.aside = 0, action.press, action.aside
         state.middle = np.nan if action.middle is None else action.middle
+        state.spread = np.nan if action.spread is None else action.spread
         state.stops = state.doubts_grip = state.layings = state.lowers_next = 0
         kept = AttemptHistory(discrete_state.get_mutable_value(self._history_index))
         state.set_downs = kept.set_downs(action.pick)
@@ -383,6 +389,7 @@ def _action_of(state: PlannerState) -> PickPlaceAction:
         press=bool(state.press),
         aside=bool(state.aside),
         middle=known_point(state.middle),
+        spread=known_spread(state.spread),
     )
 
 

@@ -110,6 +110,8 @@ class PlannerState(VectorView):
     """1 if the action lays the object aside, else 0."""
     middle = Array(2)
     """The action's `middle`, in m; NaN if it is None."""
+    spread = Array(3)
+    """The action's `spread`, in m^2; NaN if it is None."""
     let_go_z = Number()
     """Height of the fingertips when the hand began to retreat. `carries_since` is the time since
     which it has felt the weight of an object in the retreat; infinite if it feels none."""

@@ -282,6 +282,9 @@ class PickPlaceAction:
     middle: tuple[float, float] | None = None
     """World (x, y), in metres, of the middle of the picked object as the policy sees it; None if
     unknown. It tells objects apart in the `history`, wherever they are gripped."""
+    spread: tuple[float, float, float] | None = None
+    """Variances xx, xy and yy of the visible points of the picked object about `middle`, in m^2 in
+    the world; None if unknown. They tell roughly what the object covers after it was placed."""
     left_over: LeftOver | None = None
     """The objects and cavities that a policy still sees when it stops; None if it does not report
     them."""

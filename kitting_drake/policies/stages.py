@@ -21,6 +21,7 @@ from kitting_drake.policies.matching.regions.segmentation import Region
 from kitting_drake.policies.matching.regions.visibility import Visibility
 from kitting_drake.policies.matching.release_clearance import blocked_at_place
 from kitting_drake.policies.matching.separating import separating_action, turning_action
+from kitting_drake.policies.matching.shape_matching import best_insertion
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import wrap_to_pi
 
@@ -110,7 +111,7 @@ class JawRoom:
             look.resolution,
             self.planner,
             look.failed_pixels,
-            None if region is None else look.inventory.balance(region),
+            None if region is None else look.inventory.memory.balance(region),
         )
         if grasp is None:
             return draft
@@ -306,9 +307,10 @@ class Recovery:
     """Corrects failed insertions (`recovery_action`), takes heaps apart (`separating_action`), and
     turns objects over (`turning_action`).
 
-    It presses a protruding object down at once, and moves it or takes it out if the next object
-    needs its place (`Inventory.needs_clearing`). The other corrections take several actions, so
-    they come only when no object fits into a recess.
+    If the networks find no grasp of an object that fits into a recess, the outlines may find one
+    (`best_insertion`). It presses a protruding object down at once, and moves it or takes it out if
+    the next object needs its place (`Inventory.needs_clearing`). The other corrections take several
+    actions, so they come only when no object fits into a recess.
     """
 
     planner: PickPlaceParameters
@@ -325,5 +327,9 @@ class Recovery:
             return dataclasses.replace(draft, mending=mending) if first else draft
         if draft.stop:
             arguments = look.inventory, self.planner, look.failed_picks
+            # The networks' grasp may lack room where another grasp of the object has room.
+            inserted, _ = best_insertion(*arguments)
+            if inserted is not None:
+                return dataclasses.replace(draft, mending=inserted.action)
             mending = separating_action(*arguments) or mending or turning_action(*arguments)
         return dataclasses.replace(draft, mending=mending)

@@ -5,7 +5,13 @@ from systems.signals import LeftOver, PickPlaceAction, PlanarPose
 
 
 def action(number: int) -> PickPlaceAction:
-    return PickPlaceAction(PlanarPose(number, 0.1, 0.2), PlanarPose(0.5, -0.1, 1.0), press=True)
+    return PickPlaceAction(
+        PlanarPose(number, 0.1, 0.2),
+        PlanarPose(0.5, -0.1, 1.0),
+        press=True,
+        middle=(0.3, number) if number % 3 else None,
+        spread=(0.01, -0.02, number) if number % 3 else None,
+    )
 
 
 def test_attempts_come_back_in_order_and_the_oldest_are_forgotten():

@@ -869,7 +869,8 @@ def test_a_contact_force_beyond_the_limit_stops_the_action(mode: Mode, force: tu
     assert run.output("counts").tolist() == [1, 0, 0, 1]
     (attempt,) = run.output("history")
     assert (attempt.outcome, attempt.action.pick) == ("stopped", PICK)
-    assert 30.5 < attempt.peak_force < 37.5
+    # The mean over 1/64 s: the force grows until the hand stops.
+    assert 15.0 < attempt.peak_force < 37.5
     vertical, lateral, where = run.output("peak_force")
     assert Mode(int(where)) == mode
     assert max(vertical, lateral) == attempt.peak_force

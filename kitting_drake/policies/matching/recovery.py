@@ -71,7 +71,7 @@ def recovery_action(
         )
         if mended is not None:
             return mended
-    for place in inventory.unseated:
+    for place in inventory.memory.unseated:
         pressed = _press_far_end(observation, segmentation, place)
         if not _is_near(pressed.pick, tried):
             return pressed
@@ -135,7 +135,7 @@ def _take_out(
     for part in (region, *topmost_layers(segmentation, region)):
         for grasp in jaw_grasps(segmentation, part, resolution, planner, support=top):
             action = make_action(observation, grasp.pixel, grasp.theta, free, 0.0)
-            if not _is_near(action.pick, tried) and not inventory.was_removed(part):
+            if not _is_near(action.pick, tried) and not inventory.memory.was_removed(part):
                 return replace(action, aside=True)
     return None
 
@@ -150,7 +150,7 @@ def _move_to_place(
     distance in the range `_BESIDE`; None if there is no such action."""
     observation, segmentation = inventory.observation, inventory.segmentation
     resolution = observation.grid.resolution
-    off = inventory.misplacement(region)
+    off = inventory.memory.misplacement(region)
     if off is None or not _BESIDE[0] < np.linalg.norm(off) * resolution < _BESIDE[1]:
         return None
     top = _top_around(segmentation, region)

@@ -65,7 +65,7 @@ class ShapeMatchingPolicy:
             mending = recovery_action(inventory, self._planner, failed_picks)
         if mending is not None and mending.press:
             return Matched(mending)
-        matched, reason = self._insert(inventory, failed_picks)
+        matched, reason = best_insertion(inventory, self._planner, failed_picks)
         if matched is not None:
             if mending is not None and inventory.needs_clearing(matched.action):
                 return Matched(inventory.named(mending))
@@ -80,32 +80,42 @@ class ShapeMatchingPolicy:
         reason = reason or inventory.why_stop
         return Matched(PickPlaceAction(stop=True, reason=reason, left_over=inventory.left_over))
 
-    def _insert(
-        self, inventory: Inventory, failed_picks: Sequence[PlanarPose]
-    ) -> tuple[Matched | None, str]:
-        """Returns the best insertion and an empty string; if no insertion is possible, None and the
-        reason."""
-        observation, segmentation = inventory.observation, inventory.segmentation
-        failed = failed_pixels(observation.grid, failed_picks)
-        resolution = observation.grid.resolution
-        reason = ""
-        for pair in inventory.pairs:
-            reason, fit = "not seen", pair.fit
-            region = segmentation.objects[pair.item]
-            grasps = jaw_grasps(
-                segmentation, region, resolution, self._planner, balance=inventory.balance(region)
+
+def best_insertion(
+    inventory: Inventory, planner: PickPlaceParameters, failed_picks: Sequence[PlanarPose] = ()
+) -> tuple[Matched | None, str]:
+    """Finds the best-fitting object for which the jaws have room.
+
+    Args:
+        inventory: the objects and recesses of the observation.
+        planner: parameters of the motion with which the hand will pick and place.
+        failed_picks: gripper poses at which a grasp failed before; they are avoided.
+
+    Returns:
+        The action that inserts the object, and an empty string. If no insertion is possible, None
+            and the reason, a key of `STOP_REASONS`; it is empty if no object fits.
+    """
+    observation, segmentation = inventory.observation, inventory.segmentation
+    failed = failed_pixels(observation.grid, failed_picks)
+    resolution = observation.grid.resolution
+    reason = ""
+    for pair in inventory.pairs:
+        reason, fit = "not seen", pair.fit
+        region = segmentation.objects[pair.item]
+        grasps = jaw_grasps(
+            segmentation, region, resolution, planner, balance=inventory.memory.balance(region)
+        )
+        grasps = untried(grasps, failed, resolution)
+        if not grasps:
+            reason = "not sure"
+            continue
+        best = grasps[0]
+        place = fit.moved(best.pixel)
+        footprint = region.pixels.astype(float)
+        if segmentation.visibility.place_is_seen(footprint, best.pixel, fit.rotation, place):
+            action = make_action(observation, best.pixel, best.theta, place, fit.rotation)
+            geometry = geometric_evidence(
+                segmentation, best.pixel, fit.rotation, place, fit.cost, best.cost
             )
-            grasps = untried(grasps, failed, resolution)
-            if not grasps:
-                reason = "not sure"
-                continue
-            best = grasps[0]
-            place = fit.moved(best.pixel)
-            footprint = region.pixels.astype(float)
-            if segmentation.visibility.place_is_seen(footprint, best.pixel, fit.rotation, place):
-                action = make_action(observation, best.pixel, best.theta, place, fit.rotation)
-                geometry = geometric_evidence(
-                    segmentation, best.pixel, fit.rotation, place, fit.cost, best.cost
-                )
-                return Matched(inventory.named(action), geometry), ""
-        return None, reason
+            return Matched(inventory.named(action), geometry), ""
+    return None, reason

@@ -250,7 +250,7 @@ def segment(observation: Observation) -> Segmentation:
             # Ignore regions of mostly unseen pixels: in the shadow of a block, a few wrong depths
             # can make the filled-in heights look like an object.
             if observation.valid[item.mask].mean() > _OBJECT_SEEN
-            and not _is_corner(item, fixture, highest, resolution)
+            and not _is_corner(item, fixture, relief, highest, resolution)
         ),
         recesses=_regions(deep | hidden, depth, resolution, areas.recess, core=deep),
         protruding=tuple(
@@ -266,14 +266,16 @@ def segment(observation: Observation) -> Segmentation:
     )
 
 
-def _is_corner(item: Region, fixture: Mask, top: float, resolution: float) -> bool:
+def _is_corner(
+    item: Region, fixture: Mask, relief: NDArray[np.float32], top: float, resolution: float
+) -> bool:
     """Whether a region that is small, or lies at the image's border, is a part of the fixture that
-    the mask `fixture` misses."""
+    the mask `fixture` misses. It is as high as the fixture; a tool that leans on it is not."""
     border = item.mask.copy()
     border[1:-1, 1:-1] = False
     if item.mask.sum() * resolution**2 >= LEAST_AREA and not border.any():
         return False
-    if item.height < top - PLANE_BAND:
+    if np.median(relief[item.mask]) < top - PLANE_BAND:
         return False
     near = ndimage.binary_dilation(item.mask, iterations=round(2 * _FIXTURE_MARGIN / resolution))
     return bool((near & fixture).any())

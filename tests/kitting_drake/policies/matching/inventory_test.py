@@ -152,7 +152,7 @@ def test_an_object_that_is_lost_on_its_way_again_and_again_is_not_tried_forever(
     # The history of an object that still lies there is not that of its neighbour.
     beside = scene((hammer(60, 180), 0.015), (bar(60, 240), 0.015))
     found = Inventory.of(dataclasses.replace(beside, history=tuple(lost)))
-    tries = {int(item.mask.sum()): found.tries(item) for item in found.segmentation.objects}
+    tries = {int(item.mask.sum()): found.memory.tries(item) for item in found.segmentation.objects}
     assert tries[int(bar(60, 240).sum())] == 0
 
 
@@ -312,3 +312,67 @@ def test_a_recess_whose_object_was_taken_out_is_free_even_if_its_floor_looks_rou
     found = Inventory.of(dataclasses.replace(seen, history=(taken_out,)))
     assert len(found.free_recesses) == 2
     assert found.why_stop == "gave up"
+
+
+def placed_by_policy(observation: Observation, top: float = 0.05) -> Attempt:
+    """The action of shape matching on an observation, as if it had succeeded."""
+    action = ShapeMatchingPolicy(PLANNER)(observation)
+    assert not action.stop
+    return Attempt(action, "placed", top=top)
+
+
+def test_with_noise_the_parts_of_a_filled_recess_are_not_free():
+    """The handle's end lies 40 pixels from the head, where the hammer was gripped."""
+    history = (placed_by_policy(scene((hammer(60, 180), 0.015))),)
+    seen = noisy(scene())
+    seen.image[3, 30:54, 55:85] = 0.05
+    assert len(Inventory.of(seen).free_recesses) == 2
+    (free,) = Inventory.of(dataclasses.replace(seen, history=history)).free_recesses
+    assert free.mask[bar(75, 40)].all()
+
+
+def test_a_placed_object_that_left_its_recess_is_missing():
+    """It slid off the table: nothing is loose, but its recess is as deep as before."""
+    seen = scene()
+    history = (placed_by_policy(scene((hammer(60, 180), 0.015))),)
+    found = Inventory.of(dataclasses.replace(seen, history=history))
+    assert found.why_stop == "gave up" and len(found.free_recesses) == 2
+    seen.image[3, hammer(30, 35)] = 0.05
+    found = Inventory.of(dataclasses.replace(seen, history=history))
+    assert found.why_stop == "done"
+
+
+def test_an_object_that_was_dropped_out_of_sight_is_missing():
+    dropped = dataclasses.replace(placed_by_policy(scene((bar(60, 180), 0.015))), outcome="dropped")
+    empty = scene()
+    assert Inventory.of(empty).why_stop == "done"
+    assert Inventory.of(dataclasses.replace(empty, history=(dropped,))).why_stop == "gave up"
+
+
+@pytest.mark.parametrize(("column", "reason"), [(310, "not seen"), (200, "nothing fits")])
+def test_an_object_that_is_only_partly_seen_does_not_fit_nowhere(column: int, reason: str):
+    part = np.zeros(GRID.shape, bool)
+    part[60:72, column : column + 10] = True
+    assert Inventory.of(scene((part, 0.015))).why_stop == reason
+
+
+@pytest.mark.parametrize(("rise", "reason"), [(0.0025, "done"), (0.005, "gave up")])
+def test_an_object_that_was_pressed_and_is_hardly_proud_is_placed(rise: float, reason: str):
+    history = (placed_by_policy(scene((hammer(60, 180), 0.015))),)
+    full = scene(filled=True)
+    full.image[3, hammer(30, 35)] = 0.05 + rise
+    seen = dataclasses.replace(full, history=history)
+    press = ShapeMatchingPolicy(PLANNER, recover=True)(seen)
+    assert press.press
+    history += (Attempt(press, "pressed"),)
+    found = Inventory.of(dataclasses.replace(full, history=history))
+    assert found.why_stop == reason
+    assert len(found.left_over.objects) == (reason == "gave up")
+
+
+def test_a_tool_that_leans_on_the_kit_at_the_edge_of_the_image_is_no_corner_of_the_kit():
+    seen = scene()
+    for column in range(113, 160):
+        seen.image[3, 80:90, column] = 0.05 * min(1.0, (160 - column) / 40)
+    found = Inventory.of(Observation(np.roll(seen.image, 160, axis=2), GRID))
+    assert len(found.segmentation.objects) == 1
