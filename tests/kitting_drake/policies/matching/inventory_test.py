@@ -373,6 +373,6 @@ def test_an_object_that_was_pressed_and_is_hardly_proud_is_placed(rise: float, r
 def test_a_tool_that_leans_on_the_kit_at_the_edge_of_the_image_is_no_corner_of_the_kit():
     seen = scene()
     for column in range(113, 160):
-        seen.image[3, 80:90, column] = 0.05 * min(1.0, (160 - column) / 40)
+        seen.image[3, 80:90, column] = 0.015 + 0.045 * (160 - column) / 47
     found = Inventory.of(Observation(np.roll(seen.image, 160, axis=2), GRID))
     assert len(found.segmentation.objects) == 1
