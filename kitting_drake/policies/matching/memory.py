@@ -190,8 +190,17 @@ class Memory:
         shows."""
         if attempt.action.spread is None:
             return self.recess_at(attempt.action.place) is recess
-        points = self.observation.grid.to_world(recess.pixels)
-        return bool(_covered(attempt, points).mean() > _COVERED)
+        xx, xy, yy = attempt.action.spread
+        turn = rotation_matrix(attempt.action.place.theta - attempt.action.pick.theta)
+        away = self.observation.grid.to_world(recess.pixels) - _middle_left_at(attempt)
+        away = away @ turn
+        squared = (away @ np.linalg.inv([[xx, xy], [xy, yy]]) * away).sum(axis=1)
+        return bool((squared < _DEVIATIONS**2).mean() > _COVERED)
+
+    def middle(self, region: Region) -> tuple[float, float]:
+        """Returns the middle of a region, (x, y) in the world, in m."""
+        x, y = self.observation.grid.to_world(region.pixels.mean(axis=0))
+        return float(x), float(y)
 
     def is_on_fixture(self, pose: PlanarPose) -> bool:
         """Whether a gripper's pose is above a fixture."""
@@ -210,11 +219,6 @@ class Memory:
         pixel = grid.to_pixel((pose.x, pose.y))
         away = np.linalg.norm(region.pixels - pixel, axis=1).min() * grid.resolution
         return bool(away < _THERE)
-
-    def middle(self, region: Region) -> tuple[float, float]:
-        """Returns the middle of a region, (x, y) in the world, in m."""
-        x, y = self.observation.grid.to_world(region.pixels.mean(axis=0))
-        return float(x), float(y)
 
 
 def _moves_by_object(history: Sequence[Attempt]) -> list[list[Attempt]]:
@@ -264,17 +268,3 @@ def _middle_left_at(attempt: Attempt) -> tuple[float, float]:
     turn = left.theta - action.pick.theta
     cos, sin = math.cos(turn), math.sin(turn)
     return left.x + cos * x - sin * y, left.y + sin * x + cos * y
-
-
-def _covered(attempt: Attempt, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Returns which of the points (n, 2), in the world, an action's object covers where the action
-    left it: those within an ellipse around its middle. If the object's `spread` is unknown, no
-    point is covered."""
-    action = attempt.action
-    if action.spread is None:
-        return np.zeros(len(points), bool)
-    xx, xy, yy = action.spread
-    turn = rotation_matrix(_left_at(attempt).theta - action.pick.theta)
-    away = (points - _middle_left_at(attempt)) @ turn
-    squared = (away @ np.linalg.inv([[xx, xy], [xy, yy]]) * away).sum(axis=1)
-    return np.asarray(squared < _DEVIATIONS**2)
