@@ -38,6 +38,9 @@ class _Row(VectorView):
     top = Number()
     """The expected height of the placed object's top, in m in the world; NaN unless the object was
     placed."""
+    floor = Number()
+    """The height of the surface at the place before the action, in m in the world; NaN for a press,
+    and if the object was set down where it lay."""
     balance = Array(2)
     """Measured centre of mass of the object, x and y in the world in m; NaN unless the attempt set
     the object down again."""
@@ -63,6 +66,7 @@ class AttemptHistory:
         peak_force: float,
         balance: tuple[float, float] | None = None,
         top: float | None = None,
+        floor: float | None = None,
     ) -> None:
         """Adds an attempt. If there is no room, the oldest one is dropped."""
         count = self._count()
@@ -76,6 +80,7 @@ class AttemptHistory:
         row.spread = np.nan if action.spread is None else action.spread
         row.balance = (np.nan, np.nan) if balance is None else balance
         row.top = np.nan if top is None else top
+        row.floor = np.nan if floor is None else floor
         self.amend(outcome, peak_force)
 
     def amend(self, outcome: str | None, peak_force: float) -> None:
@@ -100,8 +105,9 @@ class AttemptHistory:
                 spread=known_spread(row.spread),
             )
             balance = known_point(row.balance)
-            outcome, top = OUTCOMES[int(row.outcome)], None if np.isnan(row.top) else row.top
-            found.append(Attempt(action, outcome, row.peak_force, balance, top))
+            top, floor = (None if np.isnan(z) else z for z in (row.top, row.floor))
+            outcome = OUTCOMES[int(row.outcome)]
+            found.append(Attempt(action, outcome, row.peak_force, balance, top, floor))
         return tuple(found)
 
     def failed_picks(self) -> tuple[PlanarPose, ...]:

@@ -318,7 +318,8 @@ class PickPlacePlanner(LeafSystem):
             outcome = _outcome(before, state)
             balance = _balance(state) if outcome == "set down" else None
             top = _top(state) if outcome == "placed" else None
-            history.append(_action_of(state), outcome, _peak(state), balance, top)
+            floor = None if state.press or outcome == "set down" else float(state.floor_z)
+            history.append(_action_of(state), outcome, _peak(state), balance, top, floor)
             state.free_actions += outcome == "set down"
 
     def _observe(

@@ -340,6 +340,9 @@ class Attempt:
     top: float | None = None
     """World height, in metres, that the object's top should have at the place if it stands on the
     floor there; None unless the outcome is "placed"."""
+    floor: float | None = None
+    """World height, in metres, of the surface at the place before the action; None for a press, and
+    if the object was set down where it lay."""
 
 
 def wrap_to_pi(angle: float) -> float:

@@ -18,10 +18,15 @@ def test_attempts_come_back_in_order_and_the_oldest_are_forgotten():
     history = AttemptHistory(np.full(AttemptHistory.size, np.nan))
     assert history.attempts() == history.failed_picks() == ()
     for number in range(MOST_ATTEMPTS + 3):
-        history.append(action(number), "placed" if number % 2 else "missed", float(number))
+        floor = -float(number) if number % 2 else None
+        outcome = "placed" if number % 2 else "missed"
+        history.append(action(number), outcome, float(number), floor=floor)
     found = history.attempts()
     assert [item.action for item in found] == [action(3 + n) for n in range(MOST_ATTEMPTS)]
     assert [item.peak_force for item in found] == [3.0 + n for n in range(MOST_ATTEMPTS)]
+    assert [item.floor for item in found] == [
+        -3.0 - n if (3 + n) % 2 else None for n in range(MOST_ATTEMPTS)
+    ]
     assert [pick.x for pick in history.failed_picks()] == list(range(36, 67, 2))
     history.amend("stopped", 40.0)
     last = history.attempts()[-1]

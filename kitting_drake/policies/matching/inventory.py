@@ -102,7 +102,7 @@ class Inventory:
             return seen.free_recesses
         wanted = {id(seen.recesses[pair.recess]) for pair in self.matches}
         done = [it for it in self.memory.last if it.outcome == "placed"]
-        inside = [it for it in done if not it.action.aside and not self.memory.has_left(it)]
+        inside = [it for it in done if not it.action.aside and not self.memory.is_empty(it)]
         filled = {id(it) for it in seen.recesses if any(self.memory.covers(x, it) for x in inside)}
         emptied = {id(self.memory.recess_at(it.action.pick)) for it in done if it.action.aside}
         free = {id(item) for item in seen.free_recesses} | wanted | emptied
@@ -130,11 +130,11 @@ class Inventory:
         if not areas:
             return ()
         least, most = _LEAST_SHARE * min(areas), _LARGEST_SHARE * sum(areas)
-        reach = _LEAST_REACH * min(map(_reach, self.open_recesses))
+        reach = _LEAST_REACH * min(item.reach for item in self.open_recesses)
         return tuple(
             item
             for item in self.strangers
-            if least <= item.mask.sum() <= most and _reach(item) >= reach
+            if least <= item.mask.sum() <= most and item.reach >= reach
         )
 
     @property
@@ -182,14 +182,15 @@ class Inventory:
         """Whether the objects of a region were tried often enough. For None the result is False.
 
         `_MOST_TRIES` actions on one object are enough. A region that fits into no recess is not
-        tried once more if all objects that it can contain were laid there before and it touches no
-        other region, which may hide a part of it.
+        tried once more if all objects that it can contain were laid there before, it is seen whole
+        and it touches no other region, which may hide a part of it.
         """
         if region is None:
             return False
         fits_nowhere = self.pair_of(region) is None and not self.is_reversed(region)
         laid = sum(moves[-1].outcome == "placed" for moves in self.memory.moves_of(region))
-        if fits_nowhere and laid and not self._may_contain(region, laid + 1):
+        is_whole = not self._is_cut(region) and not self._may_contain(region, laid + 1)
+        if fits_nowhere and laid and is_whole:
             return self._is_alone(region) or self.memory.tries(region) >= _MOST_TRIES
         return self.memory.tries(region) >= _MOST_TRIES
 
@@ -239,12 +240,6 @@ class Inventory:
         """Whether an object reaches the edge of o_t or of the cameras' views."""
         beyond = ~np.pad(self.segmentation.visibility.in_view, 1)
         return bool((ndimage.binary_dilation(beyond)[1:-1, 1:-1] & item.mask).any())
-
-
-def _reach(region: Region) -> float:
-    """Returns the largest distance of a region's pixels from their mean, in pixels."""
-    pixels = region.pixels
-    return float(np.linalg.norm(pixels - pixels.mean(axis=0), axis=1).max())
 
 
 def mask_of(regions: tuple[Region, ...], shape: tuple[int, int]) -> NDArray[np.bool_]:

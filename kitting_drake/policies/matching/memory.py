@@ -30,10 +30,9 @@ reaches 1.7, an ellipse 2."""
 _NOT_SEATED, _NOISE = 0.001, 4.0
 """A placed object is not seated if its top is higher than expected by more than `_NOT_SEATED`, in
 metres, and by more than `_NOISE` standard deviations of the noise."""
-_AWAY, _AWAY_NOISE = 0.002, 20.0
-"""A placed object has left its place if the surface there is lower than its top should be, by more
-than `_AWAY`, in metres, and by more than `_AWAY_NOISE` standard deviations of the noise, which may
-hide a thin object."""
+_FILLED = 0.002
+"""A recess is empty if the surface in it differs from its floor by less than this, in metres, or by
+less than `_NOISE` standard deviations of the noise."""
 _MOST_REMOVALS = 3
 """The largest number of objects that are taken out of one part of the kit."""
 _COVERED = 0.5
@@ -59,20 +58,20 @@ class Memory:
         return tuple(moves[-1] for moves in moved if moves)
 
     def is_missing(self, last: Attempt) -> bool:
-        """Whether an object, by the last action on it, is neither where it was gripped nor where it
-        should be."""
-        return last.outcome in _LOST or self.has_left(last)
+        """Whether an object, by the last action on it, may be lost: the action moved it, but the
+        recess at its place is still empty."""
+        return last.outcome in ("placed", *_LOST) and self.is_empty(last)
 
-    def has_left(self, attempt: Attempt) -> bool:
-        """Whether an object that was placed in the kit does not lie there any more."""
-        if attempt.top is None or attempt.action.aside:
+    def is_empty(self, attempt: Attempt) -> bool:
+        """Whether the recess at an action's place is as deep as before the action."""
+        place, grid = attempt.action.place, self.observation.grid
+        if attempt.floor is None or attempt.action.aside or not self.is_on_fixture(place):
             return False
-        doubt = max(_AWAY, _AWAY_NOISE * self.segmentation.noise)
-        place = attempt.action.place
-        return (
-            self.is_on_fixture(place)
-            and read_surface_heights(self.observation, place, place).pick_top < attempt.top - doubt
-        )
+        row, col = np.rint(grid.to_pixel((place.x, place.y))).astype(int)
+        doubt = max(_FILLED, _NOISE * self.segmentation.noise)
+        top = read_surface_heights(self.observation, place, place).pick_top
+        is_recess = self.segmentation.depth[row, col] > doubt
+        return bool(is_recess and abs(top - attempt.floor) < doubt)
 
     @property
     def has_filled(self) -> bool:

@@ -87,6 +87,17 @@ class Region:
         return slice(low[0], high[0]), slice(low[1], high[1])
 
     @cached_property
+    def inner_radius(self) -> float:
+        """The largest distance, in pixels, from a pixel of the region to the region's edge."""
+        return float(ndimage.distance_transform_edt(np.pad(self.mask[self.box], 1)).max())
+
+    @cached_property
+    def reach(self) -> float:
+        """The largest distance of the region's pixels from their mean, in pixels."""
+        away = self.pixels - self.pixels.mean(axis=0)
+        return float(np.linalg.norm(away, axis=1).max())
+
+    @cached_property
     def outlines(self) -> dict[tuple[float, bool], Any]:
         """The outlines that `outline_of` has computed, by its arguments."""
         return {}
@@ -164,8 +175,7 @@ class Segmentation:
     def _is_wide(self, recess: Region) -> bool:
         """Whether a recess is seen, and wider than the gap around an object."""
         return bool(
-            _inner_radius(recess.mask[recess.box])
-            > max(_GAP, _LEAST_GAP / self.visibility.resolution)
+            recess.inner_radius > max(_GAP, _LEAST_GAP / self.visibility.resolution)
             and self.visibility.seen[recess.mask].mean() > _RECESS_SEEN
         )
 
@@ -279,11 +289,6 @@ def _is_corner(
         return False
     near = ndimage.binary_dilation(item.mask, iterations=round(2 * _FIXTURE_MARGIN / resolution))
     return bool((near & fixture).any())
-
-
-def _inner_radius(mask: Mask) -> float:
-    """Returns the largest distance, in pixels, from a pixel of a mask to the mask's edge."""
-    return float(ndimage.distance_transform_edt(np.pad(mask, 1)).max())
 
 
 def _noise_of(

@@ -314,11 +314,11 @@ def test_a_recess_whose_object_was_taken_out_is_free_even_if_its_floor_looks_rou
     assert found.why_stop == "gave up"
 
 
-def placed_by_policy(observation: Observation, top: float = 0.05) -> Attempt:
+def placed_by_policy(observation: Observation) -> Attempt:
     """The action of shape matching on an observation, as if it had succeeded."""
     action = ShapeMatchingPolicy(PLANNER)(observation)
     assert not action.stop
-    return Attempt(action, "placed", top=top)
+    return Attempt(action, "placed", top=0.05, floor=0.035)
 
 
 def test_with_noise_the_parts_of_a_filled_recess_are_not_free():
@@ -337,9 +337,10 @@ def test_a_placed_object_that_left_its_recess_is_missing():
     history = (placed_by_policy(scene((hammer(60, 180), 0.015))),)
     found = Inventory.of(dataclasses.replace(seen, history=history))
     assert found.why_stop == "gave up" and len(found.free_recesses) == 2
-    seen.image[3, hammer(30, 35)] = 0.05
+    # A flat hammer lies in it, lower than expected: it had lain on another tool.
+    seen.image[3, hammer(30, 35)] = 0.04
     found = Inventory.of(dataclasses.replace(seen, history=history))
-    assert found.why_stop == "done"
+    assert found.why_stop == "done" and len(found.free_recesses) == 1
 
 
 def test_an_object_that_was_dropped_out_of_sight_is_missing():
