@@ -30,9 +30,11 @@ reaches 1.7, an ellipse 2."""
 _NOT_SEATED, _NOISE = 0.001, 4.0
 """A placed object is not seated if its top is higher than expected by more than `_NOT_SEATED`, in
 metres, and by more than `_NOISE` standard deviations of the noise."""
-_FILLED = 0.002
-"""A recess is empty if the surface in it differs from its floor by less than this, in metres, or by
-less than `_NOISE` standard deviations of the noise."""
+_FILLED, _NEAR = 0.002, 0.020
+"""A recess is empty if the surface in it, within `_NEAR` of the place, differs from its floor by
+less than `_FILLED`, in metres, or by less than `_NOISE` standard deviations of the noise."""
+_AS_LARGE = 0.5
+"""The pixels of an empty recess have at least this share of the variance of its object's pixels."""
 _MOST_REMOVALS = 3
 """The largest number of objects that are taken out of one part of the kit."""
 _COVERED = 0.5
@@ -63,15 +65,20 @@ class Memory:
         return last.outcome in ("placed", *_LOST) and self.is_empty(last)
 
     def is_empty(self, attempt: Attempt) -> bool:
-        """Whether the recess at an action's place is as deep as before the action."""
-        place, grid = attempt.action.place, self.observation.grid
-        if attempt.floor is None or attempt.action.aside or not self.is_on_fixture(place):
+        """Whether the recess at an action's place is as deep as before the action, and about as
+        large as the action's object. The hole of a ring is as deep, but smaller."""
+        action, grid = attempt.action, self.observation.grid
+        recess = self.recess_at(action.place)
+        if attempt.floor is None or action.spread is None or action.aside or recess is None:
             return False
-        row, col = np.rint(grid.to_pixel((place.x, place.y))).astype(int)
+        spread = recess.pixels.var(axis=0).sum() * grid.resolution**2
+        if spread < _AS_LARGE * (action.spread[0] + action.spread[2]):
+            return False
+        away = grid.to_world(recess.pixels) - (action.place.x, action.place.y)
+        near = recess.pixels[np.linalg.norm(away, axis=1) < _NEAR]
+        floor = grid.z_min + float(np.median(self.observation.filled_height[tuple(near.T)]))
         doubt = max(_FILLED, _NOISE * self.segmentation.noise)
-        top = read_surface_heights(self.observation, place, place).pick_top
-        is_recess = self.segmentation.depth[row, col] > doubt
-        return bool(is_recess and abs(top - attempt.floor) < doubt)
+        return bool(abs(floor - attempt.floor) < doubt)
 
     @property
     def has_filled(self) -> bool:

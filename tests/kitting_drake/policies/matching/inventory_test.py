@@ -343,6 +343,26 @@ def test_a_placed_object_that_left_its_recess_is_missing():
     assert found.why_stop == "done" and len(found.free_recesses) == 1
 
 
+def test_the_hole_of_a_placed_ring_is_no_empty_recess():
+    rows, cols = np.indices(GRID.shape)
+    away = np.hypot(rows - 65, cols - 65)
+    block = np.zeros(GRID.shape, np.float32)
+    block[20:110, 20:110] = 0.05
+    block[away < 20] = 0.035
+    for inner, reason in ((16.0, "done"), (25.0, "gave up")):
+        height = block.copy()
+        height[(away < 19) & (away > inner)] = 0.049
+        spread = (20**2 + 14**2) / 4 * GRID.resolution**2
+        x, y = GRID.to_world((65.0, 65.0)).tolist()
+        action = PickPlaceAction(
+            PlanarPose(), PlanarPose(x, y), middle=(0.0, 0.0), spread=(spread, 0.0, spread)
+        )
+        image = np.full((4, *GRID.shape), 0.5, np.float32)
+        image[3] = height
+        history = (Attempt(action, "placed", top=0.049, floor=0.035),)
+        assert Inventory.of(Observation(image, GRID, history=history)).why_stop == reason
+
+
 def test_an_object_that_was_dropped_out_of_sight_is_missing():
     dropped = dataclasses.replace(placed_by_policy(scene((bar(60, 180), 0.015))), outcome="dropped")
     empty = scene()
