@@ -66,7 +66,7 @@ class ContactGuard:
 
     A peak is the largest mean over 1/64 s, as a wrist sensor would show it. In a shorter time the
     force of an impact is its impulse divided by the plant's step, and so depends on the step. The
-    guard acts on single samples, so a peak may be below the limit although the guard acted.
+    guard compares each sample with the limit, so a peak may be below the limit although it acted.
     """
 
     def __init__(self, limit: float, step: float) -> None:

@@ -318,7 +318,8 @@ class PickPlacePlanner(LeafSystem):
             outcome = _outcome(before, state)
             balance = _balance(state) if outcome == "set down" else None
             top = _top(state) if outcome == "placed" else None
-            floor = None if state.press or outcome == "set down" else float(state.floor_z)
+            # A trial lift that is given up has replaced the floor's height.
+            floor = None if state.press or state.doubts_grip else float(state.floor_z)
             history.append(_action_of(state), outcome, _peak(state), balance, top, floor)
             state.free_actions += outcome == "set down"
 

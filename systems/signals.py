@@ -282,14 +282,22 @@ class PickPlaceAction:
     middle: tuple[float, float] | None = None
     """World (x, y), in metres, of the middle of the picked object as the policy sees it; None if
     unknown. It tells objects apart in the `history`, wherever they are gripped."""
-    spread: tuple[float, float, float] | None = None
-    """Variances xx, xy and yy of the visible points of the picked object about `middle`, in m^2 in
-    the world; None if unknown. They tell roughly what the object covers after it was placed."""
     left_over: LeftOver | None = None
     """The objects and cavities that a policy still sees when it stops; None if it does not report
     them."""
     heights: SurfaceHeights | None = None
     """Heights of the surfaces around pick and place. If None, the planner reads them off o_t."""
+    spread: tuple[float, float, float] | None = None
+    """Variances xx, xy and yy of the visible points of the picked object about `middle`, in m^2 in
+    the world; None if unknown. They tell roughly what the object covers after it was placed."""
+
+    def __post_init__(self) -> None:
+        if self.spread is not None:
+            xx, xy, yy = self.spread
+            if not (xx > 0 and xx * yy > xy**2):
+                raise ValueError(
+                    f"spread must be the variances of a positive definite matrix, not {self.spread}"
+                )
 
     @property
     def poses(self) -> dict[str, PlanarPose]:
@@ -332,7 +340,8 @@ class Attempt:
     outcome: str
     """The outcome of the action, a word of `OUTCOMES`."""
     peak_force: float = 0.0
-    """The largest contact force on the hand, in N, without the weight of the held object."""
+    """The largest contact force on the hand, in N, without the weight of the held object, as a mean
+    over 1/64 s. It may be below the limit although the action was stopped."""
     balance: tuple[float, float] | None = None
     """World (x, y), in metres, of the object's centre of mass; None unless the outcome is "set
     down". It is estimated from the moment on the wrist, which shows only the position along the

@@ -330,6 +330,7 @@ class Recovery:
             # The networks' grasp may lack room where another grasp of the object has room.
             inserted, _ = best_insertion(*arguments)
             if inserted is not None:
-                return dataclasses.replace(draft, mending=inserted.action)
+                first = mending is not None and look.inventory.needs_clearing(inserted.action)
+                return dataclasses.replace(draft, mending=mending if first else inserted.action)
             mending = separating_action(*arguments) or mending or turning_action(*arguments)
         return dataclasses.replace(draft, mending=mending)

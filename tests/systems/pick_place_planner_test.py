@@ -337,6 +337,7 @@ def test_an_object_that_would_turn_is_set_down_where_it_was_and_its_balance_is_t
     set_down, placed = run.output("history")
     assert (set_down.outcome, placed.outcome) == ("set down", "placed")
     assert placed.balance is None
+    assert set_down.floor is None and placed.floor == pytest.approx(HEIGHTS.place_floor)
     # The accepted pick's theta may differ from the given one by pi.
     theta = set_down.action.pick.theta
     felt = np.array(set_down.balance) - (PICK.x, PICK.y)

@@ -30,11 +30,12 @@ reaches 1.7, an ellipse 2."""
 _NOT_SEATED, _NOISE = 0.001, 4.0
 """A placed object is not seated if its top is higher than expected by more than `_NOT_SEATED`, in
 metres, and by more than `_NOISE` standard deviations of the noise."""
-_FILLED, _NEAR = 0.002, 0.020
-"""A recess is empty if the surface in it, within `_NEAR` of the place, differs from its floor by
-less than `_FILLED`, in metres, or by less than `_NOISE` standard deviations of the noise."""
-_AS_LARGE = 0.5
-"""The pixels of an empty recess have at least this share of the variance of its object's pixels."""
+_FILLED = 0.002
+"""A recess is empty if its floor is seen where it was, to within this, in metres, or to within
+`_NOISE` standard deviations of the noise."""
+_AS_LARGE, _AS_WIDE = 0.5, 0.7
+"""The pixels of an empty recess have at least the share `_AS_LARGE` of the variance of its object's
+pixels. Its inner radius is at least `_AS_WIDE` standard deviations of them across the object."""
 _MOST_REMOVALS = 3
 """The largest number of objects that are taken out of one part of the kit."""
 _COVERED = 0.5
@@ -66,18 +67,25 @@ class Memory:
 
     def is_empty(self, attempt: Attempt) -> bool:
         """Whether the recess at an action's place is as deep as before the action, and about as
-        large as the action's object. The hole of a ring is as deep, but smaller."""
-        action, grid = attempt.action, self.observation.grid
+        large as the action's object.
+
+        The hole of a placed ring and the gap around a placed object are as deep, but smaller or
+        narrower.
+        """
+        action, resolution = attempt.action, self.observation.grid.resolution
         recess = self.recess_at(action.place)
         if attempt.floor is None or action.spread is None or action.aside or recess is None:
             return False
-        spread = recess.pixels.var(axis=0).sum() * grid.resolution**2
-        if spread < _AS_LARGE * (action.spread[0] + action.spread[2]):
+        xx, xy, yy = action.spread
+        narrow = np.linalg.eigvalsh([[xx, xy], [xy, yy]])[0]
+        if recess.pixels.var(axis=0).sum() * resolution**2 < _AS_LARGE * (
+            xx + yy
+        ) or recess.inner_radius * resolution < _AS_WIDE * math.sqrt(narrow):
             return False
-        away = grid.to_world(recess.pixels) - (action.place.x, action.place.y)
-        near = recess.pixels[np.linalg.norm(away, axis=1) < _NEAR]
-        floor = grid.z_min + float(np.median(self.observation.filled_height[tuple(near.T)]))
         doubt = max(_FILLED, _NOISE * self.segmentation.noise)
+        if attempt.top is not None:
+            doubt = min(doubt, (attempt.top - attempt.floor) / 2)
+        floor = read_surface_heights(self.observation, action.place, action.place).place_floor
         return bool(abs(floor - attempt.floor) < doubt)
 
     @property

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from kitting_drake.policies.data.images import rotation_matrix
 from kitting_drake.policies.matching.inventory import Inventory
@@ -12,6 +13,7 @@ from kitting_drake.policies.matching.separating import separating_action, turnin
 from kitting_drake.policies.matching.shape_matching import ShapeMatchingPolicy
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import Attempt, Observation, PickPlaceAction, PixelGrid, PlanarPose
+from systems.surface_heights import read_surface_heights
 
 GRID = PixelGrid()
 PLANNER = PickPlaceParameters()
@@ -23,6 +25,16 @@ def hammer(rows: int, cols: int) -> NDArray[np.bool_]:
     mask[rows + 8 : rows + 15, cols : cols + 50] = True
     mask[rows : rows + 24, cols + 42 : cols + 50] = True
     return mask
+
+
+def rotated(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """A mask whose object is rotated by 90 degrees about the middle of its bounding box."""
+    pixels = np.argwhere(mask)
+    middle = np.rint((pixels.min(axis=0) + pixels.max(axis=0)) / 2).astype(int)
+    away = pixels - middle
+    result = np.zeros_like(mask)
+    result[middle[0] - away[:, 1], middle[1] + away[:, 0]] = True
+    return result
 
 
 def bar(rows: int, cols: int) -> NDArray[np.bool_]:
@@ -341,6 +353,50 @@ def test_a_placed_object_that_left_its_recess_is_missing():
     seen.image[3, hammer(30, 35)] = 0.04
     found = Inventory.of(dataclasses.replace(seen, history=history))
     assert found.why_stop == "done" and len(found.free_recesses) == 1
+
+
+@pytest.mark.parametrize("gap", [1, 2, 3])
+def test_the_gap_around_a_placed_object_is_no_empty_recess(gap: int):
+    history = (placed_by_policy(scene((hammer(60, 180), 0.015))),)
+    seen = scene()
+    seen.image[3, ndimage.binary_dilation(hammer(30, 35), iterations=gap)] = 0.035
+    assert Inventory.of(dataclasses.replace(seen, history=history)).why_stop == "gave up"
+    seen.image[3, hammer(30, 35)] = 0.05
+    assert Inventory.of(dataclasses.replace(seen, history=history)).why_stop == "done"
+
+
+def test_a_lost_object_is_missing_on_a_table_that_is_lower_than_calibrated():
+    action = placed_by_policy(scene((hammer(60, 180), 0.015))).action
+    low = scene()
+    low.image[3] -= 0.005
+    place = action.place
+    floor = read_surface_heights(low, place, place).place_floor
+    history = (Attempt(action, "dropped", floor=floor),)
+    assert Inventory.of(dataclasses.replace(low, history=history)).why_stop == "gave up"
+
+
+def test_an_object_that_the_edge_of_the_image_cuts_is_tried_again():
+    part = np.zeros(GRID.shape, bool)
+    part[60:72, 290:320] = True
+    laid = (placed_at((66.0, 305.0)),)
+    whole = np.roll(part, -40, axis=1)
+    tried = []
+    for mask, history in ((part, laid), (whole, (placed_at((66.0, 265.0)),))):
+        found = Inventory.of(dataclasses.replace(scene((mask, 0.015)), history=history))
+        tried.append(found.is_tried(found.segmentation.objects[0]))
+    assert tried == [False, True]
+
+
+def test_an_object_covers_its_recess_after_it_was_turned():
+    """The hammer lay across its recess."""
+    turned = rotated(hammer(60, 180))
+    history = (placed_by_policy(scene((turned, 0.015))),)
+    assert abs(np.sin(history[0].action.place.theta - history[0].action.pick.theta)) > 0.9
+    seen = noisy(scene())
+    seen.image[3, hammer(30, 35)] += 0.007
+    assert len(Inventory.of(seen).free_recesses) == 2
+    (free,) = Inventory.of(dataclasses.replace(seen, history=history)).free_recesses
+    assert free.mask[bar(75, 40)].all()
 
 
 def test_the_hole_of_a_placed_ring_is_no_empty_recess():

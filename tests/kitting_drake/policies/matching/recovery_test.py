@@ -1,5 +1,7 @@
 import dataclasses
 import math
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -7,6 +9,8 @@ import pytest
 from kitting_drake.policies.matching.inventory import Inventory
 from kitting_drake.policies.matching.recovery import recovery_action
 from kitting_drake.policies.matching.regions.segmentation import segment
+from kitting_drake.policies.matching.shape_matching import ShapeMatchingPolicy
+from kitting_drake.policies.stages import Recovery
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import Attempt, Observation, PickPlaceAction, PixelGrid, PlanarPose
 
@@ -110,6 +114,27 @@ def test_what_protrudes_is_taken_out_before_the_next_object_goes_there(
     seen = dataclasses.replace(observed(0.014), history=(out,) if removed else ())
     action = move((103.0, 245.0), place, aside=False).action
     assert Inventory.of(seen).needs_clearing(action) is obstructed
+
+
+@dataclasses.dataclass(frozen=True)
+class Stopped:
+    """As much of a draft that stops as `Recovery` reads."""
+
+    look: Any
+    belongs: bool = False
+    stop: bool = True
+    mending: PickPlaceAction | None = None
+
+
+@pytest.mark.parametrize("removed", [False, True])
+def test_where_the_networks_stop_the_outlines_insert_what_fits(removed: bool):
+    out = move((94.0, 100.0), (30.0, 250.0), aside=True)
+    seen = dataclasses.replace(observed(0.014), history=(out,) if removed else ())
+    look = SimpleNamespace(inventory=Inventory.of(seen), observation=seen, failed_picks=())
+    action = Recovery(PickPlaceParameters()).refine(Stopped(look)).mending
+    # After a removal, what protrudes is taken out first.
+    assert (bool(is_on_object(action)), action.aside) == (removed, removed)
+    assert action.pick == ShapeMatchingPolicy(PickPlaceParameters(), recover=True)(seen).pick
 
 
 def test_an_object_is_known_again_wherever_it_is_gripped():
