@@ -136,9 +136,10 @@ def known_point(point: NDArray[np.float64]) -> tuple[float, float] | None:
 
 
 def known_spread(spread: NDArray[np.float64]) -> tuple[float, float, float] | None:
-    """Returns the stored variances (3) of an object's points; None if they are NaN."""
+    """Returns the stored variances (3) of an object's points; None if they are NaN, or zero as
+    before the first action."""
     xx, xy, yy = spread.tolist()
-    return None if np.isnan(xx) else (xx, xy, yy)
+    return (xx, xy, yy) if xx > 0 else None
 
 
 class LeftOverVector:
