@@ -28,8 +28,10 @@ class AttemptMemory:
     - `mode` (1): mode of the `PickPlacePlanner`; an action begins with `APPROACH`.
     - `accepted_action` (abstract, `PickPlaceAction`): the action that the planner began last.
 
-    An attempt counts for the object whose grasp is nearest to the pick when the action begins. If
-    the ports are not connected, nothing is counted.
+    An attempt counts for the object whose grasp is nearest to the pick when the action begins. It
+    does not count if the planner sets the object down where it was: the planner carries the object
+    the next time with a larger moment, and other grasps are farther from the centre of mass. If the
+    ports are not connected, nothing is counted.
     """
 
     def __init__(
@@ -53,8 +55,10 @@ class AttemptMemory:
         self._accepted = system.DeclareAbstractInputPort(
             "accepted_action", Value(PickPlaceAction())
         )
-        # The planner's last mode, then one row of counts for each object.
-        self._index = system.DeclareDiscreteState(np.zeros(1 + len(objects) * self._most))
+        # The planner's last mode, the index of the last attempt's count (-1 if it had none), then
+        # one row of counts for each object.
+        counts = np.zeros(len(objects) * self._most)
+        self._index = system.DeclareDiscreteState(np.concatenate([[0.0, -1.0], counts]))
         self.ticket = system.discrete_state_ticket(self._index)
         """Dependency ticket for outputs that depend on `attempts`."""
         system.DeclarePeriodicDiscreteUpdateEvent(_PERIOD, 0.0, self._update)
@@ -63,7 +67,7 @@ class AttemptMemory:
         """(n, g) how often each grasp of each object was tried; g is the largest number of grasps
         of an object."""
         values = context.get_discrete_state(self._index).get_value()
-        return values[1:].reshape(len(self._objects), self._most)
+        return values[2:].reshape(len(self._objects), self._most)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         if not self._mode.HasValue(context):
@@ -72,19 +76,24 @@ class AttemptMemory:
         state = discrete_state.get_mutable_value(self._index)
         if mode == state[0]:
             return EventStatus.DidNothing()
-        state[0] = mode
+        is_set_down = state[0] == Mode.LIFT and mode == Mode.LOWER
+        state[0], counts = mode, state[2:]
+        if is_set_down and state[1] >= 0:
+            counts[int(state[1])] -= 1
         # `HasValue` evaluates the port, so call it only when the action is needed.
-        if mode != Mode.APPROACH or not self._accepted.HasValue(context):
-            return EventStatus.Succeeded()
-        action = self._accepted.Eval(context)
-        if not action.press:
-            bodies = self._body_poses.Eval(context)
-            poses = [bodies[int(item.body)] for item in self._objects]
-            found = nearest_grasp(self._grasps, poses, action.pick)
-            if found is not None:
-                index, grasp = found
-                state[1:].reshape(len(self._objects), self._most)[index, grasp] += 1
+        if mode == Mode.APPROACH and self._accepted.HasValue(context):
+            state[1] = self._find(context)
+            if state[1] >= 0:
+                counts[int(state[1])] += 1
         return EventStatus.Succeeded()
+
+    def _find(self, context: Context) -> int:
+        """The index of the count of the action that begins; -1 if it has none."""
+        action = self._accepted.Eval(context)
+        bodies = self._body_poses.Eval(context)
+        poses = [bodies[int(item.body)] for item in self._objects]
+        found = None if action.press else nearest_grasp(self._grasps, poses, action.pick)
+        return -1 if found is None else found[0] * self._most + found[1]
 
 
 def nearest_grasp(

@@ -31,7 +31,8 @@ def test_the_nearest_grasp_is_found_by_place_and_angle():
     assert nearest_grasp([()], [FIRST], turned) is None
 
 
-def test_a_slip_costs_the_others_nothing_and_the_next_grasp_is_another():
+def _picks(modes: list[Mode], number: int) -> list[tuple[int, int]]:
+    """The objects and grasps that an oracle picks if every action passes through the same modes."""
     objects = [PlacedObject(name, BodyIndex(i + 1), BOX) for i, name in enumerate("ab")]
     far = RigidTransform([0.5, 0.4, 0])
     goals = [Goal(item.name, (i,), (far,), 0.5) for i, item in enumerate(objects)]
@@ -44,11 +45,21 @@ def test_a_slip_costs_the_others_nothing_and_the_next_grasp_is_another():
     mode = oracle.GetInputPort("mode").FixValue(context, [Mode.OBSERVE])
     simulator.Initialize()
     taken = []
-    for _ in range(4):
+    for _ in range(number):
         action = oracle.GetOutputPort("action").Eval(context)
         taken.append(nearest_grasp([(MIDDLE, END)] * 2, poses[1:], action.pick))
         accepted.GetMutableData().set_value(action)
-        for now in (Mode.APPROACH, Mode.RETREAT, Mode.OBSERVE):
+        for now in modes:
             mode.GetMutableData().get_mutable_value().SetFromVector([now])
             simulator.AdvanceTo(context.get_time() + 1 / 16)
+    return taken
+
+
+def test_a_slip_costs_the_others_nothing_and_the_next_grasp_is_another():
+    taken = _picks([Mode.APPROACH, Mode.RETREAT, Mode.OBSERVE], 4)
     assert taken == [(0, 0), (1, 0), (0, 1), (1, 1)]
+
+
+def test_an_object_that_was_set_down_is_gripped_there_again():
+    modes = [Mode.APPROACH, Mode.LIFT, Mode.LOWER, Mode.RELEASE, Mode.RETREAT, Mode.OBSERVE]
+    assert _picks(modes, 2) == [(0, 0), (0, 0)]
