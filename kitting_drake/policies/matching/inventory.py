@@ -79,7 +79,7 @@ class Inventory:
         """The matches, except those of objects that were tried too often."""
         return tuple(
             pair
-            for pair in self.matches
+            for pair in self._fitting
             if self.memory.tries(self.segmentation.objects[pair.item]) < _MOST_TRIES
         )
 
@@ -101,10 +101,10 @@ class Inventory:
         seen = self.segmentation
         if seen.noise <= CLEAN and seen.objects:
             return seen.free_recesses
-        wanted = {id(seen.recesses[pair.recess]) for pair in self.matches}
+        wanted = {id(seen.recesses[pair.recess]) for pair in self._fitting}
         done = [it for it in self.memory.last if it.outcome == "placed"]
-        inside = [it for it in done if not it.action.aside and not self.memory.is_empty(it)]
-        filled = {id(it) for it in seen.recesses if any(self.memory.covers(x, it) for x in inside)}
+        covers, inside = self.memory.covers, self.memory.inside
+        filled = {id(it) for it in seen.recesses if any(covers(x, it) for x in inside)}
         emptied = {id(self.memory.recess_at(it.action.pick)) for it in done if it.action.aside}
         free = {id(item) for item in seen.free_recesses} | wanted | emptied
         return tuple(item for item in seen.recesses if id(item) in free - (filled - wanted))
@@ -163,6 +163,16 @@ class Inventory:
         if self.pairs:
             return "not sure"
         return "not seen" if any(map(self._is_cut, seen.objects)) else "nothing fits"
+
+    @cached_property
+    def _fitting(self) -> tuple[Pair, ...]:
+        """The matches, except those into what is left of a filled recess."""
+        memory, recesses = self.memory, self.segmentation.recesses
+        return tuple(
+            pair
+            for pair in self.matches
+            if not any(memory.lies_along(it, recesses[pair.recess]) for it in memory.inside)
+        )
 
     @cached_property
     def _not_placed(self) -> tuple[Region, ...]:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +41,9 @@ _MOST_REMOVALS = 3
 """The largest number of objects that are taken out of one part of the kit."""
 _COVERED = 0.5
 """A part of a recess is filled if an object covers more than this share of it."""
+_ON_AXIS = 0.6
+"""The middle of such a part is on the object's long axis to within this many standard deviations of
+its points across the axis. A recess beside the object is farther away."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +63,16 @@ class Memory:
         """The last action that moved each object, or should have moved it."""
         moved = ([it for it in moves if it.outcome != "pressed"] for moves in self.moves)
         return tuple(moves[-1] for moves in moved if moves)
+
+    @cached_property
+    def inside(self) -> tuple[Attempt, ...]:
+        """The last action on each object that lies where this action placed it, as far as o_t
+        shows."""
+        return tuple(
+            it
+            for it in self.last
+            if it.outcome == "placed" and not it.action.aside and not self.is_empty(it)
+        )
 
     def is_missing(self, last: Attempt) -> bool:
         """Whether an object, by the last action on it, may be lost: the action moved it, but the
@@ -202,14 +216,32 @@ class Memory:
     def covers(self, attempt: Attempt, recess: Region) -> bool:
         """Whether the object that an action placed is in a recess, or in the part of it that o_t
         shows."""
-        if attempt.action.spread is None:
+        away = self._offsets(attempt, recess.pixels)
+        if away is None:
             return self.recess_at(attempt.action.place) is recess
-        xx, xy, yy = attempt.action.spread
-        turn = rotation_matrix(attempt.action.place.theta - attempt.action.pick.theta)
-        away = self.observation.grid.to_world(recess.pixels) - _middle_left_at(attempt)
-        away = away @ turn
-        squared = (away @ np.linalg.inv([[xx, xy], [xy, yy]]) * away).sum(axis=1)
-        return bool((squared < _DEVIATIONS**2).mean() > _COVERED)
+        return bool(((away**2).sum(axis=1) < _DEVIATIONS**2).mean() > _COVERED)
+
+    def lies_along(self, attempt: Attempt, recess: Region) -> bool:
+        """Whether an object that an action placed covers a recess, and the recess's middle is on
+        the object's long axis.
+
+        Such a recess is what is left of the object's own, even if another object seems to fit.
+        """
+        middle = self._offsets(attempt, recess.pixels.mean(axis=0, keepdims=True))
+        return self.covers(attempt, recess) and (middle is None or abs(middle[0, 0]) < _ON_AXIS)
+
+    def _offsets(self, attempt: Attempt, pixels: NDArray[Any]) -> NDArray[np.float64] | None:
+        """Returns the offsets (n, 2) of n pixels from the middle of an action's object after the
+        action, across and along its long axis, in standard deviations of its points; None if these
+        are unknown."""
+        action = attempt.action
+        if action.spread is None:
+            return None
+        xx, xy, yy = action.spread
+        variances, axes = np.linalg.eigh([[xx, xy], [xy, yy]])
+        turn = rotation_matrix(_left_at(attempt).theta - action.pick.theta)
+        away = self.observation.grid.to_world(pixels) - _middle_left_at(attempt)
+        return np.asarray(away @ turn @ axes / np.sqrt(variances))
 
     def middle(self, region: Region) -> tuple[float, float]:
         """Returns the middle of a region, (x, y) in the world, in m."""
