@@ -139,6 +139,7 @@ class OutlinePlace:
             draft.place,
             look.resolution,
             look.inventory.pairs,
+            look.inventory.memory.unfilled_recesses,
         )
         if fitted is not None:
             return dataclasses.replace(

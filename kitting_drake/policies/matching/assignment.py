@@ -49,15 +49,16 @@ class Pair:
     """The mismatch of object and recess, see `registration.mismatch`, in metres."""
 
 
-def match(segmentation: Segmentation, resolution: float) -> list[Pair]:
+def match(segmentation: Segmentation, regions: Sequence[Region], resolution: float) -> list[Pair]:
     """Returns pairs of a loose object and the recess into which it fits, best fit first. Each
     object and each recess occurs at most once.
 
     Args:
         segmentation: the segmentation of an observation.
+        regions: the recesses of the segmentation into which objects may go.
         resolution: the side of a pixel, in metres.
     """
-    objects, regions = segmentation.objects, segmentation.unfilled_recesses
+    objects = segmentation.objects
     if not objects or not regions:
         return []
     outlines = [outline_of(item, resolution, close=True) for item in objects]

@@ -57,10 +57,11 @@ class Inventory:
     def of(cls, observation: Observation) -> Inventory:
         """Computes the inventory of an observation."""
         segmentation, resolution = segment(observation), observation.grid.resolution
-        pairs = match(segmentation, resolution)
+        recesses = Memory(observation, segmentation).unfilled_recesses
+        pairs = match(segmentation, recesses, resolution)
         split = split_touching(segmentation, pairs, resolution)
         if split is not segmentation:
-            pairs = match(split, resolution)
+            pairs = match(split, recesses, resolution)
         wrong = reversed_objects(split, pairs, resolution)
         return cls(
             observation,
@@ -79,7 +80,7 @@ class Inventory:
         """The matches, except those of objects that were tried too often."""
         return tuple(
             pair
-            for pair in self._fitting
+            for pair in self.matches
             if self.memory.tries(self.segmentation.objects[pair.item]) < _MOST_TRIES
         )
 
@@ -101,7 +102,7 @@ class Inventory:
         seen = self.segmentation
         if seen.noise <= CLEAN and seen.objects:
             return seen.free_recesses
-        wanted = {id(seen.recesses[pair.recess]) for pair in self._fitting}
+        wanted = {id(seen.recesses[pair.recess]) for pair in self.matches}
         done = [it for it in self.memory.last if it.outcome == "placed"]
         covers, inside = self.memory.covers, self.memory.inside
         filled = {id(it) for it in seen.recesses if any(covers(x, it) for x in inside)}
@@ -163,16 +164,6 @@ class Inventory:
         if self.pairs:
             return "not sure"
         return "not seen" if any(map(self._is_cut, seen.objects)) else "nothing fits"
-
-    @cached_property
-    def _fitting(self) -> tuple[Pair, ...]:
-        """The matches, except those into what is left of a filled recess."""
-        memory, recesses = self.memory, self.segmentation.recesses
-        return tuple(
-            pair
-            for pair in self.matches
-            if not any(memory.lies_along(it, recesses[pair.recess]) for it in memory.inside)
-        )
 
     @cached_property
     def _not_placed(self) -> tuple[Region, ...]:

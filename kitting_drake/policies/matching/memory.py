@@ -74,6 +74,14 @@ class Memory:
             if it.outcome == "placed" and not it.action.aside and not self.is_empty(it)
         )
 
+    @cached_property
+    def unfilled_recesses(self) -> tuple[Region, ...]:
+        """The recesses into which objects may go: those that are not filled, as far as o_t shows,
+        except what is left of recesses that were filled."""
+        unfilled = self.segmentation.unfilled_recesses
+        left = (it for it in unfilled if not any(self._is_left_of(x, it) for x in self.inside))
+        return tuple(left)
+
     def is_missing(self, last: Attempt) -> bool:
         """Whether an object, by the last action on it, may be lost: the action moved it, but the
         recess at its place is still empty."""
@@ -221,12 +229,10 @@ class Memory:
             return self.recess_at(attempt.action.place) is recess
         return bool(((away**2).sum(axis=1) < _DEVIATIONS**2).mean() > _COVERED)
 
-    def lies_along(self, attempt: Attempt, recess: Region) -> bool:
-        """Whether an object that an action placed covers a recess, and the recess's middle is on
-        the object's long axis.
-
-        Such a recess is what is left of the object's own, even if another object seems to fit.
-        """
+    def _is_left_of(self, attempt: Attempt, recess: Region) -> bool:
+        """Whether a recess is what is left of the recess into which an action placed its object:
+        the object covers it, and its middle is on the object's long axis. Another object may seem
+        to fit into it."""
         middle = self._offsets(attempt, recess.pixels.mean(axis=0, keepdims=True))
         return self.covers(attempt, recess) and (middle is None or abs(middle[0, 0]) < _ON_AXIS)
 

@@ -89,6 +89,7 @@ def refine_place(
     place: Array,
     resolution: float,
     pairs: Sequence[Pair] = (),
+    recesses: tuple[Region, ...] | None = None,
 ) -> RefinedPlace | None:
     """Refines a predicted place. Returns None if the outlines do not determine it.
 
@@ -100,13 +101,15 @@ def refine_place(
         resolution: the side of a pixel, in metres.
         pairs: the result of `match`. If a pair has this object and the predicted recess, the better
             of two fits is used: that of the pair, or the one that starts at the prediction.
+        recesses: the recesses into which objects may go; None for all that are not filled, as far
+            as the segmentation shows.
     """
     taken = nearest_region(segmentation.objects, pick)
     if taken is None:
         return None
     outline = outline_of(taken, resolution, close=True)
     goal = place + rotation_matrix(rotation) @ (outline.middle - pick)
-    unfilled = segmentation.unfilled_recesses
+    unfilled = segmentation.unfilled_recesses if recesses is None else recesses
     recess = nearest_region(unfilled, goal)
     if recess is None:
         return None

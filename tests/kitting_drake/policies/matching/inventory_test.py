@@ -343,6 +343,18 @@ def test_with_noise_the_parts_of_a_filled_recess_are_not_free():
     assert free.mask[bar(75, 40)].all()
 
 
+def test_nothing_is_placed_into_what_is_left_of_a_filled_recess():
+    """Only the placed hammer's head fills its recess, and a bar would fit beside it."""
+    history = (placed_by_policy(scene((hammer(60, 180), 0.015))),)
+    seen = noisy(scene((bar(30, 180), 0.015), (bar(80, 180), 0.015)))
+    seen.image[3, 30:54, 69:80] = 0.05
+    assert len(Inventory.of(seen).pairs) == 2
+    found = Inventory.of(dataclasses.replace(seen, history=history))
+    (pair,) = found.pairs
+    assert found.segmentation.recesses[pair.recess].mask[bar(75, 40)].all()
+    assert all(item.mask[bar(75, 40)].all() for item in found.memory.unfilled_recesses)
+
+
 def test_a_placed_object_that_left_its_recess_is_missing():
     """It slid off the table: nothing is loose, but its recess is as deep as before."""
     seen = scene()

@@ -151,7 +151,8 @@ def test_an_object_that_fits_is_picked_even_if_the_networks_miss_it(seen):
     assert not action.stop
     segmentation = segment(observation)
     fitting = [
-        segmentation.objects[pair.item] for pair in match(segmentation, observation.grid.resolution)
+        segmentation.objects[pair.item]
+        for pair in match(segmentation, segmentation.unfilled_recesses, observation.grid.resolution)
     ]
     assert any(item.mask[pixel_of(observation, action)] for item in fitting)
     assert LearnedPolicy(networks, orientations=36)(observation).stop
@@ -306,11 +307,11 @@ def test_tools_match_recesses_and_a_box_does_not(seen):
     observation, _ = seen
     segmentation = segment(observation)
     resolution = observation.grid.resolution
-    assert len(match(segmentation, resolution)) == 4
+    assert len(match(segmentation, segmentation.unfilled_recesses, resolution)) == 4
     # The box's base is the largest square that fits into a recess.
     box = np.zeros(segmentation.fixture.shape, bool)
     box[4:18, 4:18] = True
     recesses = dataclasses.replace(
         segmentation, objects=(dataclasses.replace(segmentation.objects[0], mask=box),)
     )
-    assert match(recesses, resolution) == []
+    assert match(recesses, recesses.unfilled_recesses, resolution) == []
