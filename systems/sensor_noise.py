@@ -73,6 +73,10 @@ class SensorNoiseParameters:
     rig_position_error: float = bounded(0.0, 0.0, 0.1)
     rig_angle_error_deg: float = bounded(0.0, 0.0, 20.0)
 
+    # Error of the calibrated height of all cameras, in m. If it is positive, the table and
+    # everything on it seem to lie too high by as much.
+    rig_height_error: float = bounded(0.0, -0.1, 0.1)
+
     @property
     def is_none(self) -> bool:
         """Whether all imperfections are off."""
@@ -88,6 +92,7 @@ class SensorNoiseParameters:
                 self.camera_angle_error_deg,
                 self.rig_position_error,
                 self.rig_angle_error_deg,
+                self.rig_height_error,
             )
         )
 
@@ -162,7 +167,8 @@ class SensorNoise(LeafSystem):
             parameters.rig_position_error,
             parameters.rig_angle_error_deg,
         )
-        self._X_rig = middle @ rig @ middle.inverse()
+        rise = RigidTransform([0.0, 0.0, parameters.rig_height_error])
+        self._X_rig = rise @ middle @ rig @ middle.inverse()
         own = np.random.default_rng([seed, _CAMERA_STREAM, number])
         self._X_camera = _pose_error(
             own, parameters.camera_position_error, parameters.camera_angle_error_deg

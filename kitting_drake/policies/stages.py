@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from kitting_drake.policies.data.images import make_action
 from kitting_drake.policies.draft import Draft, Stage, expected_position
 from kitting_drake.policies.matching.inventory import mask_of
-from kitting_drake.policies.matching.recovery import recovery_action
+from kitting_drake.policies.matching.recovery import recovery_action, seating_action
 from kitting_drake.policies.matching.refinement import nearest_region, refine_grasp, refine_place
 from kitting_drake.policies.matching.regions.segmentation import Region
 from kitting_drake.policies.matching.regions.visibility import Visibility
@@ -305,8 +305,8 @@ class SeenOnly:
 
 @dataclass(frozen=True)
 class Recovery:
-    """Corrects failed insertions (`recovery_action`), takes heaps apart (`separating_action`), and
-    turns objects over (`turning_action`).
+    """Corrects failed insertions (`recovery_action`, `seating_action`), takes heaps apart
+    (`separating_action`), and turns objects over (`turning_action`).
 
     If the networks find no grasp of an object that fits into a recess, the outlines may find one
     (`best_insertion`). It presses a protruding object down at once, and moves it or takes it out if
@@ -333,5 +333,10 @@ class Recovery:
             if inserted is not None:
                 first = mending is not None and look.inventory.needs_clearing(inserted.action)
                 return dataclasses.replace(draft, mending=mending if first else inserted.action)
-            mending = separating_action(*arguments) or mending or turning_action(*arguments)
+            mending = (
+                mending
+                or separating_action(*arguments)
+                or seating_action(look.inventory, look.failed_picks)
+                or turning_action(*arguments)
+            )
         return dataclasses.replace(draft, mending=mending)

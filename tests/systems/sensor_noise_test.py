@@ -237,6 +237,12 @@ def camera_error(seed: int, number: int = 0) -> RigidTransform:
     return POSE.inverse() @ believed_pose(seed=seed, number=number, **errors)
 
 
+def test_a_height_error_lifts_every_camera():
+    for number in (0, 1):
+        lifted = believed_pose(seed=7, number=number, rig_height_error=-0.005)
+        assert lifted.IsNearlyEqualTo(RigidTransform([0, 0, -0.005]) @ POSE, 1e-12)
+
+
 @pytest.mark.parametrize("error", [rig_error, camera_error])
 def test_pose_errors_depend_on_the_seed(error: Callable[[int], RigidTransform]):
     first, other = error(7), error(8)

@@ -4,8 +4,8 @@ An object that protrudes from the fixture is not seated. If it protrudes a littl
 down once. If it protrudes more, or this did not help, it is moved to its place if it lies a little
 beside it: such a short motion is more exact than the first one, in which an error of the cameras'
 calibration counts twice if the object is rotated by half a turn. Else it is taken out and laid on
-the table to be tried again. An object that is jammed below the rim is pressed down once. This uses
-only heights and is not in the paper.
+the table to be tried again. An object that is jammed below the rim is pressed down once, when
+nothing else is left to do. This uses only heights and is not in the paper.
 """
 
 from __future__ import annotations
@@ -71,8 +71,19 @@ def recovery_action(
         )
         if mended is not None:
             return mended
+    return None
+
+
+def seating_action(
+    inventory: Inventory, tried: Sequence[PlanarPose] = ()
+) -> PickPlaceAction | None:
+    """Returns an action that presses on an object that is jammed in its recess, below the fixture's
+    top; None if there is none.
+
+    The arguments are those of `recovery_action`.
+    """
     for place in inventory.memory.unseated:
-        pressed = _press_far_end(observation, segmentation, place)
+        pressed = _press_far_end(inventory.observation, inventory.segmentation, place)
         if not _is_near(pressed.pick, tried):
             return pressed
     return None

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from kitting_drake.policies.matching.inventory import Inventory
-from kitting_drake.policies.matching.recovery import recovery_action
+from kitting_drake.policies.matching.recovery import recovery_action, seating_action
 from kitting_drake.policies.matching.regions.segmentation import segment
 from kitting_drake.policies.matching.shape_matching import ShapeMatchingPolicy
 from kitting_drake.policies.stages import Recovery
@@ -183,12 +183,13 @@ def test_an_object_that_is_jammed_below_the_rim_is_pressed_once_at_its_far_end(
         Observation(image, GRID, np.ones(GRID.shape, bool)),
         history=(dataclasses.replace(put, top=TOP - 0.006 - higher),),
     )
-    action = mending(seen)
+    inventory = Inventory.of(seen)
+    action = seating_action(inventory)
     assert (action is not None and action.press) is presses
     if action is not None:
         row, col = GRID.to_pixel((action.pick.x, action.pick.y))
         assert 61 < row < 64 and 105 < col < 124
-        assert mending(seen, [action.pick]) is None
+        assert seating_action(inventory, [action.pick]) is None
 
 
 @pytest.mark.parametrize(("off", "moves"), [(1.0, True), (2.5, True), (0.3, False), (6.0, False)])
