@@ -23,6 +23,8 @@ class _Row:
     """The scenario's file and name, as in a summary."""
     perturbed: bool = False
     """Whether all perturbations are applied, at the level `moderate`."""
+    height_error: float = 0.0
+    """The error of the cameras' calibrated height, in m."""
     own_shapes: bool = True
     """Whether the shapes of `!AssemblingKits` are those of this project."""
 
@@ -33,6 +35,16 @@ _ROWS = (
         "unseen toolsets, `--perturb all:moderate`",
         "kitting_unseen:KittingUnseenToolsets",
         perturbed=True,
+    ),
+    _Row(
+        "unseen toolsets, table calibrated 5 mm too high",
+        "kitting_unseen:KittingUnseenToolsets",
+        height_error=0.005,
+    ),
+    _Row(
+        "unseen toolsets, table calibrated 5 mm too low",
+        "kitting_unseen:KittingUnseenToolsets",
+        height_error=-0.005,
     ),
     _Row("pairs of tools that touch", "heaps:touching"),
     _Row("pairs of tools, one across the other", "heaps:crossed"),
@@ -93,9 +105,11 @@ def harder_scenes_table(runs: Sequence[Run]) -> str:
 
 def _is_of(run: Run, row: _Row) -> bool:
     scenario: dict[str, Any] = run.summary["resolved_scenario"]
+    noise = scenario["sensor_noise"]
     return (
         run.summary["scenario"] == row.scenario
-        and bool(scenario["sensor_noise"]["depth_std"]) == row.perturbed
+        and bool(noise["depth_std"]) == row.perturbed
+        and noise.get("rig_height_error", 0.0) == row.height_error
         and (not scenario["task"].get("shapes")) == row.own_shapes
     )
 

@@ -52,6 +52,7 @@ _ADDED: dict[str, Any] = {
     "task.kit.always_nested": False,
     "task.kit.fixed_size": False,
     "sensor_noise.frames": 1,
+    "sensor_noise.rig_height_error": 0.0,
     "end_at_success": False,
 }
 """Fields that the summaries of older versions lack, with the values that those versions used."""

@@ -32,6 +32,7 @@ def rows(text: str) -> dict[str, list[str]]:
 def test_each_run_is_in_its_row():
     noise = {"sensor_noise": {"depth_std": 0.001}}
     unseen = "kitting_unseen:KittingUnseenToolsets"
+    low = {"sensor_noise": {"depth_std": 0.0, "rig_height_error": -0.005}}
     shapes = {"task": {"shapes": "folder"}}
     table = rows(
         harder_scenes_table(
@@ -40,6 +41,7 @@ def test_each_run_is_in_its_row():
                 run("heaps:heap", "shape_matching", 0.5),
                 run(unseen, "generalist", 0.98),
                 run(unseen, "generalist", 0.94, **noise),
+                run(unseen, "generalist", 0.96, **low),
                 run("assembling_kits:Test", "oracle", 0.97, **shapes),
                 run("heaps:crossed", "generalist", 0.1, seed=7),
             ]
@@ -54,6 +56,7 @@ def test_each_run_is_in_its_row():
     ]
     assert table["unseen toolsets"][0].startswith("98.0")
     assert table["unseen toolsets, `--perturb all:moderate`"][0].startswith("94.0")
+    assert table["unseen toolsets, table calibrated 5 mm too low"][0].startswith("96.0")
     public = table["five of Ravens' fourteen shapes in a kit"]
     assert public[:2] == ["-", "-"]
     assert public[2].startswith("97.0")
