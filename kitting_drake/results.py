@@ -19,7 +19,7 @@ from rich.console import Console
 
 from kitting_drake.common.command_line import run_command
 from kitting_drake.common.files import write_atomically
-from kitting_drake.reproduction.page.harder_scenes import harder_scenes_table
+from kitting_drake.reproduction.page.harder_scenes import harder_scenes_table, stop_reasons_table
 from kitting_drake.reproduction.page.protocol_page import protocol_page
 from kitting_drake.reproduction.page.results_page import results_page
 from kitting_drake.reproduction.page.robustness import robustness_table, with_figures
@@ -71,6 +71,7 @@ def main() -> int:
     if robustness.exists():
         page = with_figures(robustness.read_text(), robustness_table(others))
         page = with_figures(page, harder_scenes_table(others), "harder scenes")
+        page = with_figures(page, stop_reasons_table(others), "stop reasons")
         page = with_figures(page, flat_shapes_table(answers), "flat shapes")
         write_atomically(robustness, page)
     Console(quiet=arguments.quiet).print(

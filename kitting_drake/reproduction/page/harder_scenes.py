@@ -1,5 +1,6 @@
-"""Writes the table of `docs/robustness.md` about scenes that are harder than the tidy table."""
+"""Writes the tables of `docs/robustness.md` about scenes that are harder than the tidy table."""
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -69,20 +70,8 @@ def harder_scenes_table(runs: Sequence[Run]) -> str:
     Args:
         runs: all runs. Of several runs of a policy in a row, the one with the highest seeds counts.
     """
-    chosen = sorted(
-        (
-            run
-            for run in runs
-            if run.summary["seeds"][0]
-            in (FIRST_SEEDS if run.method == "generalist" else _OTHER_SEEDS)
-        ),
-        key=lambda run: run.summary["seeds"][0],
-    )
     rows = []
-    for row in _ROWS:
-        found = {run.method: run.summary for run in chosen if _is_of(run, row)}
-        if not found:
-            continue
+    for row, found in _rows(runs):
         shown = found.get("generalist")
         rows.append(
             [
@@ -101,6 +90,41 @@ def harder_scenes_table(runs: Sequence[Run]) -> str:
         return "No runs yet.\n"
     headings = ["scene", *_POLICIES.values(), "force, N", "right reasons to stop"]
     return markdown_table(headings, rows)
+
+
+def stop_reasons_table(runs: Sequence[Run]) -> str:
+    """Writes the table of the reasons for which the generalist's episodes in these scenes ended,
+    right ones and wrong ones. Without runs it is a sentence that says so.
+
+    Args:
+        runs: all runs, as for `harder_scenes_table`.
+    """
+    right, wrong = Counter[str](), Counter[str]()
+    for _, found in _rows(runs):
+        for reason, count in found.get("generalist", {}).get("stop_reasons", {}).items():
+            right[reason] += count["right"]
+            wrong[reason] += count["wrong"]
+    if not right + wrong:
+        return "No runs yet.\n"
+    rows = [[f"`{it}`", str(right[it]), str(wrong[it])] for it, _ in (right + wrong).most_common()]
+    return markdown_table(["reason", "right", "wrong"], rows)
+
+
+def _rows(runs: Sequence[Run]) -> list[tuple[_Row, dict[str, dict[str, Any]]]]:
+    """Returns each row that has runs, with the summaries of its runs by method."""
+    chosen = sorted(
+        (
+            run
+            for run in runs
+            if run.summary["seeds"][0]
+            in (FIRST_SEEDS if run.method == "generalist" else _OTHER_SEEDS)
+        ),
+        key=lambda run: run.summary["seeds"][0],
+    )
+    found = [
+        (row, {run.method: run.summary for run in chosen if _is_of(run, row)}) for row in _ROWS
+    ]
+    return [(row, summaries) for row, summaries in found if summaries]
 
 
 def _is_of(run: Run, row: _Row) -> bool:

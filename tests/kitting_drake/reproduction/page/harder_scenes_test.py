@@ -2,7 +2,11 @@
 
 from typing import Any
 
-from kitting_drake.reproduction.page.harder_scenes import FIRST_SEEDS, harder_scenes_table
+from kitting_drake.reproduction.page.harder_scenes import (
+    FIRST_SEEDS,
+    harder_scenes_table,
+    stop_reasons_table,
+)
 from kitting_drake.reproduction.page.runs import Run
 
 
@@ -64,5 +68,13 @@ def test_each_run_is_in_its_row():
     assert not any("one across" in label for label in table)
 
 
+def test_the_reasons_of_the_generalist_s_runs_are_added():
+    runs = [run(name, "generalist", 0.9) for name in ("heaps:heap", "heaps:crossed")]
+    others = [run("heaps:heap", "oracle", 1.0), run("heaps:heap", "generalist", 0.9, seed=7)]
+    table = rows(stop_reasons_table([*runs, *others]))
+    assert table["`done`"] == ["42", "2"]
+    assert table["`gave up`"] == ["6", "0"]
+
+
 def test_without_runs_there_is_no_table():
-    assert harder_scenes_table([]) == "No runs yet.\n"
+    assert harder_scenes_table([]) == stop_reasons_table([]) == "No runs yet.\n"
