@@ -31,6 +31,9 @@ TRIAL = 0.010
 _OVERSHOOT = 0.05
 """The goal of a lift is this far above the travel height (see `MotionHeights`), in m, so that the
 hand does not stop there."""
+_CAREFUL_SPEED = 0.25
+"""The largest speed, in m/s, at which the hand lifts an object that it lays aside. The object may
+turn in the jaws and then hit the kit or another object."""
 _HOLDING = (Mode.LIFT, Mode.CARRY, Mode.LOWER, Mode.SEARCH)
 """The modes in which an object is in the hand."""
 
@@ -191,6 +194,8 @@ class HandMotion(JawMotion):
         """The limits of the present mode's motion."""
         mode = Mode(int(state.mode))
         limits, share = self._limits[mode], float(state.gentleness)
+        if mode == Mode.LIFT and state.aside:
+            limits = replace(limits, speed=min(limits.speed, _CAREFUL_SPEED))
         if not share or mode not in _HOLDING:
             return limits
         return replace(

@@ -955,6 +955,19 @@ def test_what_is_laid_aside_is_lowered_slowly_from_higher_up():
     assert max(slow) <= PARAMETERS.contact_speed + 1e-6
 
 
+def test_what_is_laid_aside_is_lifted_slowly():
+    """It may turn in the jaws and hit what lies around it."""
+    fastest = {}
+    for aside in (False, True):
+        run = Run(answer=dataclasses.replace(ACTION, aside=aside)).until(Mode.LIFT)
+        speeds = []
+        while run.sequence[-1] == Mode.LIFT:
+            speeds.append(run.output("desired_motion")[6])
+            run.simulator.AdvanceTo(run.simulator.get_context().get_time() + 1 / 128)
+        fastest[aside] = max(speeds)
+    assert fastest[True] <= 0.25 + 1e-6 < fastest[False]
+
+
 @pytest.mark.parametrize(("force", "lets_go"), [(25.0, True), (15.0, False)])
 def test_jaws_that_grip_something_fixed_let_go(force: float, lets_go: bool):
     jam = Jam(mode=Mode.CHECK, force=(0.0, force, 0.0), stiffness=SOFT)

@@ -78,9 +78,12 @@ class Memory:
     def unfilled_recesses(self) -> tuple[Region, ...]:
         """The recesses into which objects may go: those that are not filled, as far as o_t shows,
         except what is left of recesses that were filled."""
-        unfilled = self.segmentation.unfilled_recesses
-        left = (it for it in unfilled if not any(self._is_left_of(x, it) for x in self.inside))
-        return tuple(left)
+        filling = [it for it in self.inside if not self._is_as_deep(it)]
+        return tuple(
+            item
+            for item in self.segmentation.unfilled_recesses
+            if not any(self._is_left_of(it, item) for it in filling)
+        )
 
     def is_missing(self, last: Attempt) -> bool:
         """Whether an object, by the last action on it, may be lost: the action moved it, but the
@@ -96,19 +99,23 @@ class Memory:
         """
         action, resolution = attempt.action, self.observation.grid.resolution
         recess = self.recess_at(action.place)
-        if attempt.floor is None or action.spread is None or action.aside or recess is None:
+        if action.spread is None or recess is None or not self._is_as_deep(attempt):
             return False
         xx, xy, yy = action.spread
         narrow = np.linalg.eigvalsh([[xx, xy], [xy, yy]])[0]
-        if recess.pixels.var(axis=0).sum() * resolution**2 < _AS_LARGE * (
-            xx + yy
-        ) or recess.inner_radius * resolution < _AS_WIDE * math.sqrt(narrow):
+        is_large = recess.pixels.var(axis=0).sum() * resolution**2 >= _AS_LARGE * (xx + yy)
+        return bool(is_large and recess.inner_radius * resolution >= _AS_WIDE * math.sqrt(narrow))
+
+    def _is_as_deep(self, attempt: Attempt) -> bool:
+        """Whether the floor at an action's place is seen where it was before the action."""
+        place = attempt.action.place
+        if attempt.floor is None or attempt.action.aside:
             return False
         doubt = max(_FILLED, _NOISE * self.segmentation.noise)
         if attempt.top is not None:
             doubt = min(doubt, (attempt.top - attempt.floor) / 2)
-        floor = read_surface_heights(self.observation, action.place, action.place).place_floor
-        return bool(abs(floor - attempt.floor) < doubt)
+        floor = read_surface_heights(self.observation, place, place).place_floor
+        return abs(floor - attempt.floor) < doubt
 
     @property
     def has_filled(self) -> bool:
