@@ -20,6 +20,11 @@ _PERIOD = 1 / 64
 """The planner's update period, in s. The memory reads the planner's mode at the same rate."""
 
 
+_SET_DOWN = 0.3
+"""An attempt counts as much if the object is set down where it was. So a grasp is tried four times
+before another one."""
+
+
 class AttemptMemory:
     """Counts an oracle's attempts by object and grasp, in the state of the oracle's system.
 
@@ -28,10 +33,10 @@ class AttemptMemory:
     - `mode` (1): mode of the `PickPlacePlanner`; an action begins with `APPROACH`.
     - `accepted_action` (abstract, `PickPlaceAction`): the action that the planner began last.
 
-    An attempt counts for the object whose grasp is nearest to the pick when the action begins. It
-    does not count if the planner sets the object down where it was: the planner carries the object
-    the next time with a larger moment, and other grasps are farther from the centre of mass. If the
-    ports are not connected, nothing is counted.
+    An attempt counts for the object whose grasp is nearest to the pick when the action begins. If
+    the planner sets the object down where it was, the attempt counts less: with each attempt the
+    planner allows a larger moment about the pads. If the ports are not connected, nothing is
+    counted.
     """
 
     def __init__(
@@ -67,7 +72,7 @@ class AttemptMemory:
         """(n, g) how often each grasp of each object was tried; g is the largest number of grasps
         of an object."""
         values = context.get_discrete_state(self._index).get_value()
-        return values[2:].reshape(len(self._objects), self._most)
+        return np.floor(values[2:].reshape(len(self._objects), self._most))
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         if not self._mode.HasValue(context):
@@ -79,7 +84,7 @@ class AttemptMemory:
         is_set_down = state[0] == Mode.LIFT and mode == Mode.LOWER
         state[0], counts = mode, state[2:]
         if is_set_down and state[1] >= 0:
-            counts[int(state[1])] -= 1
+            counts[int(state[1])] -= 1 - _SET_DOWN
         # `HasValue` evaluates the port, so call it only when the action is needed.
         if mode == Mode.APPROACH and self._accepted.HasValue(context):
             state[1] = self._find(context)

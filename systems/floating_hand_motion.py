@@ -1,5 +1,6 @@
 """The floating hand's motion in each mode of the pick-and-place motion primitive."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -31,7 +32,7 @@ TRIAL = 0.010
 _OVERSHOOT = 0.05
 """The goal of a lift is this far above the travel height (see `MotionHeights`), in m, so that the
 hand does not stop there."""
-_CAREFUL_SPEED = 0.25
+_ASIDE_SPEED = 0.25
 """The largest speed, in m/s, at which the hand lifts an object that it lays aside. The object may
 turn in the jaws and then hit the kit or another object."""
 _HOLDING = (Mode.LIFT, Mode.CARRY, Mode.LOWER, Mode.SEARCH)
@@ -194,13 +195,13 @@ class HandMotion(JawMotion):
         """The limits of the present mode's motion."""
         mode = Mode(int(state.mode))
         limits, share = self._limits[mode], float(state.gentleness)
-        if mode == Mode.LIFT and state.aside:
-            limits = replace(limits, speed=min(limits.speed, _CAREFUL_SPEED))
-        if not share or mode not in _HOLDING:
+        if mode not in _HOLDING:
             return limits
+        share = share or 1.0
+        most = _ASIDE_SPEED if mode == Mode.LIFT and state.aside else math.inf
         return replace(
             limits,
-            speed=share * limits.speed,
+            speed=min(share * limits.speed, most),
             acceleration=share * limits.acceleration,
             yaw_acceleration=share * limits.yaw_acceleration,
         )

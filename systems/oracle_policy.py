@@ -197,7 +197,8 @@ class OraclePolicy(LeafSystem):
             failed = (
                 self._failed_picks.Eval(context) if self._failed_picks.HasValue(context) else ()
             )
-            action = self._act_in_clutter(self._table, poses, placements, kept, failed)
+            tried = self._memory.attempts(context).sum(axis=1)
+            action = self._act_in_clutter(self._table, poses, placements, kept, failed, tried)
         else:
             plan = self._plan(poses, placements, kept, self._memory.attempts(context))
             action = None if plan is None else self._action(plan, poses)
@@ -268,12 +269,13 @@ class OraclePolicy(LeafSystem):
         placements: list[Placement],
         kept: frozenset[int],
         failed: Sequence[PlanarPose],
+        tried: NDArray[np.float64],
     ) -> PickPlaceAction | None:
         """The next action if objects may lie on each other; None if nothing is left to do."""
         clutter = ClutterExpert(table, poses, failed)
         options = [
             (item, goal)
-            for goal in self._open_goals(poses, placements, kept)
+            for goal in self._open_goals(poses, placements, kept, tried)
             for item in [self._choose_object(goal, poses, placements)]
             if item is not None
         ]

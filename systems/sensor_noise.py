@@ -127,8 +127,8 @@ class SensorNoise(LeafSystem):
     - The output depth is the median of `frames` such images with independent noise.
     - Each colour channel is multiplied by a normally distributed gain of mean one.
     - `body_pose_in_world` is the *calibrated* pose, `X_Rig X_WB X_Camera`. Its errors have the
-      given sizes, in directions drawn once for each seed. The images show the view from the true
-      pose.
+      given sizes, in directions drawn once for each seed; `rig_height_error` is added to z as it
+      is. The images show the view from the true pose.
 
     All draws depend on the seed, the camera's number and the time (to the microsecond) only.
     Stateless: evaluating twice gives the same images.

@@ -15,12 +15,11 @@ from numpy.typing import NDArray
 from kitting_drake.policies.data.images import make_action
 from kitting_drake.policies.draft import Draft, Stage, expected_position
 from kitting_drake.policies.matching.inventory import mask_of
-from kitting_drake.policies.matching.recovery import recovery_action, seating_action
+from kitting_drake.policies.matching.recovery import preparing_action, recovery_action
 from kitting_drake.policies.matching.refinement import nearest_region, refine_grasp, refine_place
 from kitting_drake.policies.matching.regions.segmentation import Region
 from kitting_drake.policies.matching.regions.visibility import Visibility
 from kitting_drake.policies.matching.release_clearance import blocked_at_place
-from kitting_drake.policies.matching.separating import separating_action, turning_action
 from kitting_drake.policies.matching.shape_matching import best_insertion
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import wrap_to_pi
@@ -138,8 +137,8 @@ class OutlinePlace:
             draft.rotation,
             draft.place,
             look.resolution,
-            look.inventory.pairs,
             look.inventory.memory.unfilled_recesses,
+            look.inventory.pairs,
         )
         if fitted is not None:
             return dataclasses.replace(
@@ -239,7 +238,7 @@ class OutlineStop:
     - Any other object is picked only if the log-odds exceed the threshold by at least
       `_NOTHING_FITS`. In a scene without a fixture, reaching the threshold is enough.
     - An object that lies upside down, or should not be tried again (`Inventory.is_tried`), is not
-      picked.
+      picked, and nothing is placed into what is left of a filled recess (`Memory.is_left_over`).
     """
 
     def refine(self, draft: Draft) -> Draft:
@@ -247,7 +246,9 @@ class OutlineStop:
         region = nearest_region(inventory.segmentation.objects, draft.pick)
         if draft.belongs and not inventory.is_tried(region):
             return draft
-        if inventory.is_reversed(region):
+        recess = nearest_region(inventory.segmentation.recesses, draft.place)
+        is_filled = recess is not None and inventory.memory.is_left_over(recess)
+        if is_filled or inventory.is_reversed(region):
             return dataclasses.replace(draft, stop=True, reason=inventory.why_stop)
         odds, threshold = draft.look.picking.log_odds, draft.look.networks.stop_threshold
         new = region is not None and any(item is region for item in inventory.worth_a_try)
@@ -305,8 +306,8 @@ class SeenOnly:
 
 @dataclass(frozen=True)
 class Recovery:
-    """Corrects failed insertions (`recovery_action`, `seating_action`), takes heaps apart
-    (`separating_action`), and turns objects over (`turning_action`).
+    """Corrects failed insertions (`recovery_action`), and prepares objects that cannot be placed
+    yet (`preparing_action`).
 
     If the networks find no grasp of an object that fits into a recess, the outlines may find one
     (`best_insertion`). It presses a protruding object down at once, and moves it or takes it out if
@@ -333,10 +334,5 @@ class Recovery:
             if inserted is not None:
                 first = mending is not None and look.inventory.needs_clearing(inserted.action)
                 return dataclasses.replace(draft, mending=mending if first else inserted.action)
-            mending = (
-                mending
-                or separating_action(*arguments)
-                or seating_action(look.inventory, look.failed_picks)
-                or turning_action(*arguments)
-            )
+            mending = preparing_action(*arguments, mending)
         return dataclasses.replace(draft, mending=mending)

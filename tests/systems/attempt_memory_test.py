@@ -60,6 +60,6 @@ def test_a_slip_costs_the_others_nothing_and_the_next_grasp_is_another():
     assert taken == [(0, 0), (1, 0), (0, 1), (1, 1)]
 
 
-def test_an_object_that_was_set_down_is_gripped_there_again():
+def test_an_object_that_was_set_down_is_gripped_there_again_but_not_forever():
     modes = [Mode.APPROACH, Mode.LIFT, Mode.LOWER, Mode.RELEASE, Mode.RETREAT, Mode.OBSERVE]
-    assert _picks(modes, 2) == [(0, 0), (0, 0)]
+    assert _picks(modes, 10) == [(0, 0)] * 4 + [(1, 0)] * 4 + [(0, 1)] * 2

@@ -241,6 +241,7 @@ def test_a_height_error_lifts_every_camera():
     for number in (0, 1):
         lifted = believed_pose(seed=7, number=number, rig_height_error=-0.005)
         assert lifted.IsNearlyEqualTo(RigidTransform([0, 0, -0.005]) @ POSE, 1e-12)
+    assert not SensorNoiseParameters(rig_height_error=-0.005).is_none
 
 
 @pytest.mark.parametrize("error", [rig_error, camera_error])

@@ -83,7 +83,10 @@ def match(segmentation: Segmentation, regions: Sequence[Region], resolution: flo
 
 
 def reversed_objects(
-    segmentation: Segmentation, pairs: Sequence[Pair], resolution: float
+    segmentation: Segmentation,
+    pairs: Sequence[Pair],
+    unfilled: Sequence[Region],
+    resolution: float,
 ) -> tuple[int, ...]:
     """Finds the objects that lie upside down: the mirror images of their outlines fit free
     recesses. An object whose outline is nearly its own mirror image is never one of them.
@@ -92,6 +95,7 @@ def reversed_objects(
         segmentation: the segmentation of an observation.
         pairs: the result of `match`. A paired object's mirror image must fit clearly better than
             the object as seen.
+        unfilled: the recesses of the segmentation into which objects may go.
         resolution: the side of a pixel, in metres.
 
     Returns:
@@ -100,7 +104,7 @@ def reversed_objects(
     objects, regions = segmentation.objects, segmentation.recesses
     known = {pair.item: pair for pair in pairs}
     filled = {pair.recess for pair in pairs}
-    flat = {id(item) for item in segmentation.free_recesses}
+    flat = {id(item) for item in segmentation.free_recesses} & {id(item) for item in unfilled}
     free = [j for j, item in enumerate(regions) if id(item) in flat]
     traced = {j: outline_of(regions[j], resolution) for j in free}
     found = []

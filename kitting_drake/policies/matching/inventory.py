@@ -16,7 +16,7 @@ from kitting_drake.policies.matching.refinement import nearest_region
 from kitting_drake.policies.matching.regions.fixtures import CLEAN
 from kitting_drake.policies.matching.regions.segmentation import Region, Segmentation, segment
 from kitting_drake.policies.matching.splitting import split_touching
-from systems.signals import LeftOver, Observation, PickPlaceAction
+from systems.signals import LeftOver, Observation, PickPlaceAction, PlanarPose
 
 _OBSTRUCTED = 0.05
 """A place is obstructed if more than this share of the object would lie on protruding things."""
@@ -27,6 +27,9 @@ _MOST_TRIES = 3
 """The largest number of actions on one object."""
 _BESIDE = 3
 """Regions that are at most this many pixels apart touch each other."""
+_LEANS = 6
+"""An object that leans on the kit is two regions, at most this many pixels apart: pixels near the
+kit's edge belong to neither."""
 _LEAST_SHARE = 0.5
 """A region that contains an object for an open recess has at least this share of the smallest open
 recess's area."""
@@ -62,7 +65,7 @@ class Inventory:
         split = split_touching(segmentation, pairs, resolution)
         if split is not segmentation:
             pairs = match(split, recesses, resolution)
-        wrong = reversed_objects(split, pairs, resolution)
+        wrong = reversed_objects(split, pairs, recesses, resolution)
         return cls(
             observation,
             split,
@@ -227,15 +230,22 @@ class Inventory:
         mask = mask_of(self.segmentation.protruding, grid.shape)
         return bool(mask[tuple(target.T)].sum() > _OBSTRUCTED * len(region.pixels))
 
+    def leans(self, pick: PlanarPose) -> bool:
+        """Whether the object at a pick protrudes from the kit and touches an object on the table:
+        the two are perhaps one that leans on the kit."""
+        pixel = np.array(self.observation.grid.to_pixel((pick.x, pick.y)))
+        region = nearest_region(self.segmentation.protruding, pixel)
+        return region is not None and not self._is_alone(region, _LEANS)
+
     def _may_contain(self, region: Region, count: int) -> bool:
         """Whether a region is so large that it may contain this many objects for open recesses."""
         areas = sorted((int(item.mask.sum()) for item in self.open_recesses), reverse=True)
         largest = areas[:count]
         return len(largest) == count and bool(region.mask.sum() >= _SEVERAL * sum(largest))
 
-    def _is_alone(self, region: Region) -> bool:
-        """Whether no other object touches a region."""
-        around = ndimage.binary_dilation(region.mask, iterations=_BESIDE)
+    def _is_alone(self, region: Region, reach: int = _BESIDE) -> bool:
+        """Whether no other loose object is within a number of pixels of a region."""
+        around = ndimage.binary_dilation(region.mask, iterations=reach)
         others = (item for item in self.segmentation.objects if item is not region)
         return not any((around & item.mask).any() for item in others)
 

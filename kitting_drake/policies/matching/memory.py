@@ -22,6 +22,8 @@ _THERE = 0.015
 was picked or placed there."""
 _LOST = ("dropped", "stopped")
 """The outcomes of actions that lose an object on its way."""
+_UNMOVED = ("missed", "unreachable", "set down", "pressed")
+"""The outcomes of actions that leave an object where it was."""
 _SAME_OBJECT = 0.060
 """If an object was left closer than this to a later pick, in metres, that pick was of this
 object."""
@@ -34,7 +36,7 @@ metres, and by more than `_NOISE` standard deviations of the noise."""
 _FILLED = 0.002
 """A recess is empty if its floor is seen where it was, to within this, in metres, or to within
 `_NOISE` standard deviations of the noise."""
-_AS_LARGE, _AS_WIDE = 0.5, 0.7
+_AS_LARGE, _AS_WIDE = 0.45, 0.7
 """The pixels of an empty recess have at least the share `_AS_LARGE` of the variance of its object's
 pixels. Its inner radius is at least `_AS_WIDE` standard deviations of them across the object."""
 _MOST_REMOVALS = 3
@@ -42,8 +44,9 @@ _MOST_REMOVALS = 3
 _COVERED = 0.5
 """A part of a recess is filled if an object covers more than this share of it."""
 _ON_AXIS = 0.6
-"""The middle of such a part is on the object's long axis to within this many standard deviations of
-its points across the axis. A recess beside the object is farther away."""
+"""A recess is what is left of a filled one only if its middle is this close to the long axis of the
+placed object, in standard deviations of the object's points across the axis. Recesses beside the
+object are farther away."""
 
 
 @dataclass(frozen=True)
@@ -66,24 +69,26 @@ class Memory:
 
     @cached_property
     def inside(self) -> tuple[Attempt, ...]:
-        """The last action on each object that lies where this action placed it, as far as o_t
-        shows."""
+        """The actions that placed an object which still lies there, as far as o_t shows."""
+        moved = ([it for it in moves if it.outcome not in _UNMOVED] for moves in self.moves)
+        last = (moves[-1] for moves in moved if moves)
         return tuple(
             it
-            for it in self.last
+            for it in last
             if it.outcome == "placed" and not it.action.aside and not self.is_empty(it)
         )
 
     @cached_property
     def unfilled_recesses(self) -> tuple[Region, ...]:
-        """The recesses into which objects may go: those that are not filled, as far as o_t shows,
-        except what is left of recesses that were filled."""
-        filling = [it for it in self.inside if not self._is_as_deep(it)]
-        return tuple(
-            item
-            for item in self.segmentation.unfilled_recesses
-            if not any(self._is_left_of(it, item) for it in filling)
-        )
+        """The recesses into which objects may go. What is left of a filled recess is not one of
+        them."""
+        unfilled = self.segmentation.unfilled_recesses
+        return tuple(item for item in unfilled if not self.is_left_over(item))
+
+    def is_left_over(self, recess: Region) -> bool:
+        """Whether a recess is what is left of one that an object fills. Another object may seem to
+        fit into it."""
+        return any(self._is_left_of(attempt, recess) for attempt in self.inside)
 
     def is_missing(self, last: Attempt) -> bool:
         """Whether an object, by the last action on it, may be lost: the action moved it, but the
@@ -99,23 +104,19 @@ class Memory:
         """
         action, resolution = attempt.action, self.observation.grid.resolution
         recess = self.recess_at(action.place)
-        if action.spread is None or recess is None or not self._is_as_deep(attempt):
+        if attempt.floor is None or action.spread is None or action.aside or recess is None:
             return False
         xx, xy, yy = action.spread
         narrow = np.linalg.eigvalsh([[xx, xy], [xy, yy]])[0]
-        is_large = recess.pixels.var(axis=0).sum() * resolution**2 >= _AS_LARGE * (xx + yy)
-        return bool(is_large and recess.inner_radius * resolution >= _AS_WIDE * math.sqrt(narrow))
-
-    def _is_as_deep(self, attempt: Attempt) -> bool:
-        """Whether the floor at an action's place is seen where it was before the action."""
-        place = attempt.action.place
-        if attempt.floor is None or attempt.action.aside:
+        if recess.pixels.var(axis=0).sum() * resolution**2 < _AS_LARGE * (
+            xx + yy
+        ) or recess.inner_radius * resolution < _AS_WIDE * math.sqrt(narrow):
             return False
         doubt = max(_FILLED, _NOISE * self.segmentation.noise)
         if attempt.top is not None:
             doubt = min(doubt, (attempt.top - attempt.floor) / 2)
-        floor = read_surface_heights(self.observation, place, place).place_floor
-        return abs(floor - attempt.floor) < doubt
+        floor = read_surface_heights(self.observation, action.place, action.place).place_floor
+        return bool(abs(floor - attempt.floor) < doubt)
 
     @property
     def has_filled(self) -> bool:
@@ -237,9 +238,8 @@ class Memory:
         return bool(((away**2).sum(axis=1) < _DEVIATIONS**2).mean() > _COVERED)
 
     def _is_left_of(self, attempt: Attempt, recess: Region) -> bool:
-        """Whether a recess is what is left of the recess into which an action placed its object:
-        the object covers it, and its middle is on the object's long axis. Another object may seem
-        to fit into it."""
+        """Whether a recess is what is left of the one that an action's object fills: the object
+        covers it, and its middle is on the object's long axis."""
         middle = self._offsets(attempt, recess.pixels.mean(axis=0, keepdims=True))
         return self.covers(attempt, recess) and (middle is None or abs(middle[0, 0]) < _ON_AXIS)
 

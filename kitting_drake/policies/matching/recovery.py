@@ -4,8 +4,8 @@ An object that protrudes from the fixture is not seated. If it protrudes a littl
 down once. If it protrudes more, or this did not help, it is moved to its place if it lies a little
 beside it: such a short motion is more exact than the first one, in which an error of the cameras'
 calibration counts twice if the object is rotated by half a turn. Else it is taken out and laid on
-the table to be tried again. An object that is jammed below the rim is pressed down once, when
-nothing else is left to do. This uses only heights and is not in the paper.
+the table to be tried again. An object that is jammed below the rim is pressed down once, after
+heaps are taken apart. This uses only heights and is not in the paper.
 """
 
 from __future__ import annotations
@@ -22,7 +22,11 @@ from kitting_drake.policies.data.images import make_action
 from kitting_drake.policies.matching.inventory import Inventory
 from kitting_drake.policies.matching.jaw_clearance import jaw_grasps
 from kitting_drake.policies.matching.regions.segmentation import Mask, Region, Segmentation
-from kitting_drake.policies.matching.separating import topmost_layers
+from kitting_drake.policies.matching.separating import (
+    separating_action,
+    topmost_layers,
+    turning_action,
+)
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import Observation, PickPlaceAction, PlanarPose
 
@@ -74,14 +78,37 @@ def recovery_action(
     return None
 
 
-def seating_action(
-    inventory: Inventory, tried: Sequence[PlanarPose] = ()
+def preparing_action(
+    inventory: Inventory,
+    planner: PickPlaceParameters,
+    tried: Sequence[PlanarPose],
+    mending: PickPlaceAction | None,
 ) -> PickPlaceAction | None:
-    """Returns an action that presses on an object that is jammed in its recess, below the fixture's
-    top; None if there is none.
+    """Returns the next action if no object can be placed now; None if there is nothing to do.
 
-    The arguments are those of `recovery_action`.
+    It mends what protrudes, then takes heaps apart, then presses on jammed objects. An object that
+    may lean on the kit is part of a heap. Objects are turned over last: this is the riskiest
+    action, and the number of actions is limited.
+
+    Args:
+        inventory: the objects and recesses of the observation.
+        planner: parameters of the motion with which the hand will pick.
+        tried: gripper poses of earlier failed grasps and presses.
+        mending: the result of `recovery_action`.
     """
+    if mending is not None and not inventory.leans(mending.pick):
+        return mending
+    return (
+        separating_action(inventory, planner, tried)
+        or mending
+        or _press_jammed(inventory, tried)
+        or turning_action(inventory, planner, tried)
+    )
+
+
+def _press_jammed(inventory: Inventory, tried: Sequence[PlanarPose]) -> PickPlaceAction | None:
+    """Returns an action that presses on an object that is jammed in its recess, below the fixture's
+    top; None if there is none."""
     for place in inventory.memory.unseated:
         pressed = _press_far_end(inventory.observation, inventory.segmentation, place)
         if not _is_near(pressed.pick, tried):

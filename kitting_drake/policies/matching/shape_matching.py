@@ -10,8 +10,7 @@ from kitting_drake.policies.data.images import make_action
 from kitting_drake.policies.matching.evidence import Evidence, geometric_evidence
 from kitting_drake.policies.matching.inventory import Inventory
 from kitting_drake.policies.matching.jaw_clearance import failed_pixels, jaw_grasps, untried
-from kitting_drake.policies.matching.recovery import recovery_action, seating_action
-from kitting_drake.policies.matching.separating import separating_action, turning_action
+from kitting_drake.policies.matching.recovery import preparing_action, recovery_action
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import Observation, PickPlaceAction, PlanarPose
 
@@ -38,11 +37,9 @@ class ShapeMatchingPolicy:
         Args:
             planner: parameters of the motion with which the hand will pick and place.
             recover: whether to prepare objects that cannot be placed yet. Protruding objects are
-                pressed down at once, and taken out if the next object needs their place. If nothing
-                fits, the policy moves or takes out objects that could not be pressed down
-                (`recovery_action`), takes heaps apart (`separating_action`), presses on jammed
-                objects (`seating_action`), then turns over objects that lie upside down
-                (`turning_action`).
+                pressed down at once, and taken out if the next object needs their place
+                (`recovery_action`). For what the policy does if nothing fits see
+                `preparing_action`.
         """
         self._planner = planner
         self._recover = recover
@@ -72,15 +69,7 @@ class ShapeMatchingPolicy:
                 return Matched(inventory.named(mending))
             return matched
         if self._recover:
-            arguments = inventory, self._planner, failed_picks
-            # Turn objects over only if nothing else is left to do. This is the riskiest action, and
-            # the number of actions is limited.
-            prepared = (
-                mending
-                or separating_action(*arguments)
-                or seating_action(inventory, failed_picks)
-                or turning_action(*arguments)
-            )
+            prepared = preparing_action(inventory, self._planner, failed_picks, mending)
             if prepared is not None:
                 return Matched(inventory.named(prepared))
         reason = reason or inventory.why_stop

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from kitting_drake.policies.matching.inventory import Inventory
-from kitting_drake.policies.matching.recovery import recovery_action, seating_action
+from kitting_drake.policies.matching.recovery import preparing_action, recovery_action
 from kitting_drake.policies.matching.regions.segmentation import segment
 from kitting_drake.policies.matching.shape_matching import ShapeMatchingPolicy
 from kitting_drake.policies.stages import Recovery
@@ -176,6 +176,7 @@ def test_an_object_that_is_jammed_below_the_rim_is_pressed_once_at_its_far_end(
 ):
     height = observed().height.copy()
     height[61:65, 76:124] = TOP - 0.006
+    height[100:106, 220:270] = 0.0
     image = np.zeros((4, *GRID.shape), np.float32)
     image[3] = height
     put = move((140.0, 280.0), (63.0, 85.0), aside=False)
@@ -183,13 +184,25 @@ def test_an_object_that_is_jammed_below_the_rim_is_pressed_once_at_its_far_end(
         Observation(image, GRID, np.ones(GRID.shape, bool)),
         history=(dataclasses.replace(put, top=TOP - 0.006 - higher),),
     )
-    inventory = Inventory.of(seen)
-    action = seating_action(inventory)
+    inventory, planner = Inventory.of(seen), PickPlaceParameters()
+    action = preparing_action(inventory, planner, [], None)
     assert (action is not None and action.press) is presses
     if action is not None:
         row, col = GRID.to_pixel((action.pick.x, action.pick.y))
         assert 61 < row < 64 and 105 < col < 124
-        assert seating_action(inventory, [action.pick]) is None
+        assert preparing_action(inventory, planner, [action.pick], None) is None
+
+
+@pytest.mark.parametrize("gap", [0, 12])
+def test_an_object_that_may_lean_on_the_kit_belongs_to_a_heap(gap: int):
+    height = observed().height.copy()
+    height[90:98, 125:138] = TOP + 0.02
+    height[90:98, 140 + gap : 180 + gap] = 0.03
+    image = np.zeros((4, *GRID.shape), np.float32)
+    image[3] = height
+    inventory = Inventory.of(Observation(image, GRID, np.ones(GRID.shape, bool)))
+    (protruding,) = inventory.segmentation.protruding
+    assert inventory.leans(PlanarPose(*inventory.memory.middle(protruding))) is (gap == 0)
 
 
 @pytest.mark.parametrize(("off", "moves"), [(1.0, True), (2.5, True), (0.3, False), (6.0, False)])

@@ -189,7 +189,14 @@ def test_a_nearly_right_or_reversed_place_is_corrected(seen, turn: float):
                 key=lambda item: np.linalg.norm(item.pixels - place, axis=1).min(),
             )
             off = 2 * recess.pixels.mean(axis=0) - off
-        found = refine_place(segmentation, pick, rotation + turn + 0.05, off, grid.resolution)
+        found = refine_place(
+            segmentation,
+            pick,
+            rotation + turn + 0.05,
+            off,
+            grid.resolution,
+            segmentation.unfilled_recesses,
+        )
         assert found is not None
         assert np.linalg.norm(found.place - place) * grid.resolution < 0.003
         assert abs(math.remainder(found.rotation - rotation, math.tau)) < math.radians(2)
@@ -213,7 +220,9 @@ def test_a_place_moves_to_a_recess_that_fits_far_better():
         key=lambda item: np.linalg.norm(item.pixels - hammer, axis=1).min(),
     )
     wrong = recess.pixels.mean(axis=0)
-    found = refine_place(segmentation, pick, rotation, wrong, grid.resolution)
+    found = refine_place(
+        segmentation, pick, rotation, wrong, grid.resolution, segmentation.unfilled_recesses
+    )
     assert found is not None
     assert np.linalg.norm(found.place - place) * grid.resolution < 0.003
     assert abs(math.remainder(found.rotation - rotation, math.tau)) < math.radians(2)
@@ -255,7 +264,15 @@ def test_a_place_far_from_any_recess_is_not_refined(seen):
     far = segment(observation).fixture
     away = np.argwhere(~far)[np.linalg.norm(np.argwhere(~far) - pick, axis=1).argmax()]
     assert (
-        refine_place(segment(observation), pick, 0.3, away.astype(float), grid.resolution) is None
+        refine_place(
+            segment(observation),
+            pick,
+            0.3,
+            away.astype(float),
+            grid.resolution,
+            segment(observation).unfilled_recesses,
+        )
+        is None
     )
 
 
