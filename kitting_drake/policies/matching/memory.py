@@ -47,6 +47,9 @@ _ON_AXIS = 0.6
 """A recess is what is left of a filled one only if its middle is this close to the long axis of the
 placed object, in standard deviations of the object's points across the axis. Recesses beside the
 object are farther away."""
+_SLENDER = 0.33
+"""The points of a single tool deviate at most this much across its long axis, as a share of their
+deviation along it."""
 
 
 @dataclass(frozen=True)
@@ -238,10 +241,18 @@ class Memory:
         return bool(((away**2).sum(axis=1) < _DEVIATIONS**2).mean() > _COVERED)
 
     def _is_left_of(self, attempt: Attempt, recess: Region) -> bool:
-        """Whether a recess is what is left of the one that an action's object fills: the object
-        covers it, and its middle is on the object's long axis."""
+        """Whether a recess is what is left of the one that an action's object fills: the object is
+        slender and covers it, and its middle is on the object's long axis.
+
+        The points of a heap, from which one object was picked, are not slender.
+        """
+        if attempt.action.spread is None:
+            return False
+        xx, xy, yy = attempt.action.spread
+        narrow, wide = np.linalg.eigvalsh([[xx, xy], [xy, yy]])
         middle = self._offsets(attempt, recess.pixels.mean(axis=0, keepdims=True))
-        return self.covers(attempt, recess) and (middle is None or abs(middle[0, 0]) < _ON_AXIS)
+        is_on_axis = middle is not None and abs(middle[0, 0]) < _ON_AXIS
+        return bool(narrow < _SLENDER**2 * wide) and is_on_axis and self.covers(attempt, recess)
 
     def _offsets(self, attempt: Attempt, pixels: NDArray[Any]) -> NDArray[np.float64] | None:
         """Returns the offsets (n, 2) of n pixels from the middle of an action's object after the

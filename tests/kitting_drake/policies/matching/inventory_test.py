@@ -355,6 +355,10 @@ def test_nothing_is_placed_into_what_is_left_of_a_filled_recess():
     found = Inventory.of(dataclasses.replace(seen, history=history))
     assert not found.pairs
     assert all(item.mask[bar(75, 40)].all() for item in found.memory.unfilled_recesses)
+    # The hammer was picked from a heap, so the size of its region tells little.
+    heap = dataclasses.replace(history[0].action, spread=(0.001, 0.0, 0.002))
+    found = Inventory.of(dataclasses.replace(seen, history=(Attempt(heap, "placed"),)))
+    assert found.pairs
     # A failed attempt to take the hammer out changes nothing.
     missed = Attempt(dataclasses.replace(history[0].action, pick=history[0].action.place), "missed")
     found = Inventory.of(dataclasses.replace(seen, history=(*history, missed)))
