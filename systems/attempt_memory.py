@@ -69,8 +69,8 @@ class AttemptMemory:
         system.DeclarePeriodicDiscreteUpdateEvent(_PERIOD, 0.0, self._update)
 
     def attempts(self, context: Context) -> NDArray[np.float64]:
-        """(n, g) how often each grasp of each object was tried; g is the largest number of grasps
-        of an object."""
+        """(n, g) how often each grasp of each object was tried, rounded down; g is the largest
+        number of grasps of an object."""
         values = context.get_discrete_state(self._index).get_value()
         return np.floor(values[2:].reshape(len(self._objects), self._most))
 

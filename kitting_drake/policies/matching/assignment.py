@@ -49,36 +49,36 @@ class Pair:
     """The mismatch of object and recess, see `registration.mismatch`, in metres."""
 
 
-def match(segmentation: Segmentation, regions: Sequence[Region], resolution: float) -> list[Pair]:
+def match(segmentation: Segmentation, unfilled: Sequence[Region], resolution: float) -> list[Pair]:
     """Returns pairs of a loose object and the recess into which it fits, best fit first. Each
     object and each recess occurs at most once.
 
     Args:
         segmentation: the segmentation of an observation.
-        regions: the recesses of the segmentation into which objects may go.
+        unfilled: the recesses of the segmentation into which objects may go.
         resolution: the side of a pixel, in metres.
     """
     objects = segmentation.objects
-    if not objects or not regions:
+    if not objects or not unfilled:
         return []
     outlines = [outline_of(item, resolution, close=True) for item in objects]
-    recesses = [outline_of(item, resolution) for item in regions]
+    recesses = [outline_of(item, resolution) for item in unfilled]
     coarse = np.array([[coarse_cost(o, c) for c in recesses] for o in outlines])
     fits: dict[tuple[int, int], Registration] = {}
     costs = np.full(coarse.shape, 10 * _WORST_COST)
     for i, j in np.argwhere(coarse <= _PROMISING * coarse.min(axis=1, keepdims=True)).tolist():
         fits[i, j] = register(outlines[i], recesses[j])
         if is_covered(outlines[i], recesses[j], fits[i, j]):
-            costs[i, j] = mismatch(fits[i, j], objects[i], regions[j])
+            costs[i, j] = mismatch(fits[i, j], objects[i], unfilled[j])
     # Clip the costs, so that one hopeless pair does not outweigh all others.
     rows, cols = linear_sum_assignment(np.minimum(costs, _WORST_COST))
     index = {id(item): index for index, item in enumerate(segmentation.recesses)}
     pairs = []
     for i, j in zip(rows.tolist(), cols.tolist(), strict=True):
         if costs[i, j] < _WORST_COST:
-            known = segmentation.depth, objects[i], regions[j], (outlines[i], recesses[j])
+            known = segmentation.depth, objects[i], unfilled[j], (outlines[i], recesses[j])
             fit = better_half_turn(*known, fits[i, j])
-            pairs.append(Pair(i, index[id(regions[j])], fit, float(costs[i, j])))
+            pairs.append(Pair(i, index[id(unfilled[j])], fit, float(costs[i, j])))
     return sorted(pairs, key=lambda pair: pair.mismatch)
 
 

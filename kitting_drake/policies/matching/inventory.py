@@ -60,12 +60,12 @@ class Inventory:
     def of(cls, observation: Observation) -> Inventory:
         """Computes the inventory of an observation."""
         segmentation, resolution = segment(observation), observation.grid.resolution
-        recesses = Memory(observation, segmentation).unfilled_recesses
-        pairs = match(segmentation, recesses, resolution)
+        unfilled = Memory(observation, segmentation).unfilled_recesses
+        pairs = match(segmentation, unfilled, resolution)
         split = split_touching(segmentation, pairs, resolution)
         if split is not segmentation:
-            pairs = match(split, recesses, resolution)
-        wrong = reversed_objects(split, pairs, recesses, resolution)
+            pairs = match(split, unfilled, resolution)
+        wrong = reversed_objects(split, pairs, unfilled, resolution)
         return cls(
             observation,
             split,

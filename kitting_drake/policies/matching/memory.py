@@ -67,17 +67,14 @@ class Memory:
     @cached_property
     def last(self) -> tuple[Attempt, ...]:
         """The last action that moved each object, or should have moved it."""
-        moved = ([it for it in moves if it.outcome != "pressed"] for moves in self.moves)
-        return tuple(moves[-1] for moves in moved if moves)
+        return self._last_but(("pressed",))
 
     @cached_property
     def inside(self) -> tuple[Attempt, ...]:
         """The actions that placed an object which still lies there, as far as o_t shows."""
-        moved = ([it for it in moves if it.outcome not in _UNMOVED] for moves in self.moves)
-        last = (moves[-1] for moves in moved if moves)
         return tuple(
             it
-            for it in last
+            for it in self._last_but(_UNMOVED)
             if it.outcome == "placed" and not it.action.aside and not self.is_empty(it)
         )
 
@@ -279,6 +276,11 @@ class Memory:
             return False
         row, col = np.rint(grid.to_pixel((pose.x, pose.y))).astype(int)
         return bool(self.segmentation.fixture[row, col])
+
+    def _last_but(self, ignored: Sequence[str]) -> tuple[Attempt, ...]:
+        """The last action on each object, apart from actions with some outcomes."""
+        counted = ([it for it in moves if it.outcome not in ignored] for moves in self.moves)
+        return tuple(moves[-1] for moves in counted if moves)
 
     @property
     def _history(self) -> tuple[Attempt, ...]:

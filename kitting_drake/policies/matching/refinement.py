@@ -88,7 +88,7 @@ def refine_place(
     rotation: float,
     place: Array,
     resolution: float,
-    recesses: tuple[Region, ...],
+    unfilled: tuple[Region, ...],
     pairs: Sequence[Pair] = (),
 ) -> RefinedPlace | None:
     """Refines a predicted place. Returns None if the outlines do not determine it.
@@ -99,7 +99,7 @@ def refine_place(
         rotation: predicted rotation of the object, in radians.
         place: (row, col) predicted for the object's point under the pick.
         resolution: the side of a pixel, in metres.
-        recesses: the recesses into which objects may go.
+        unfilled: the recesses of the segmentation into which objects may go.
         pairs: the result of `match`. If a pair has this object and the predicted recess, the better
             of two fits is used: that of the pair, or the one that starts at the prediction.
     """
@@ -108,7 +108,7 @@ def refine_place(
         return None
     outline = outline_of(taken, resolution, close=True)
     goal = place + rotation_matrix(rotation) @ (outline.middle - pick)
-    recess = nearest_region(recesses, goal)
+    recess = nearest_region(unfilled, goal)
     if recess is None:
         return None
     target = outline_of(recess, resolution)
@@ -134,7 +134,7 @@ def refine_place(
             best = rival
     if best is None or best.cost > _WORST_COST:
         return None
-    others = [other for other in recesses if other is not recess]
+    others = [other for other in unfilled if other is not recess]
     elsewhere = _better_elsewhere(taken, outline, recess, target, best, others, resolution)
     if elsewhere is not None:
         best = elsewhere

@@ -259,6 +259,10 @@ def test_the_sentences_on_robustness(runs: dict[str, Summary]):
         "insertion blocked": 1,
     }
     assert sum(run["ambiguous"]["reversed"] for run in lost) == 7
+    late = [runs[f"robust_all_generalist_{seed}"] for seed in (90000, 92000, 94000, 96000)]
+    good, objects = counts(late)
+    reversed_ones = sum(run["ambiguous"]["reversed"] for run in late)
+    assert f"{reversed_ones} of the {objects - good} lost tools are offset" in text
     times = rows(page, "### How long it takes")[2:]
     for row, kind in zip(times, ("none", "depth_noise", "all"), strict=True):
         seconds = [

@@ -189,14 +189,8 @@ def test_a_nearly_right_or_reversed_place_is_corrected(seen, turn: float):
                 key=lambda item: np.linalg.norm(item.pixels - place, axis=1).min(),
             )
             off = 2 * recess.pixels.mean(axis=0) - off
-        found = refine_place(
-            segmentation,
-            pick,
-            rotation + turn + 0.05,
-            off,
-            grid.resolution,
-            segmentation.unfilled_recesses,
-        )
+        start = pick, rotation + turn + 0.05, off, grid.resolution
+        found = refine_place(segmentation, *start, segmentation.unfilled_recesses)
         assert found is not None
         assert np.linalg.norm(found.place - place) * grid.resolution < 0.003
         assert abs(math.remainder(found.rotation - rotation, math.tau)) < math.radians(2)
@@ -261,19 +255,11 @@ def test_a_place_far_from_any_recess_is_not_refined(seen):
     grid = observation.grid
     lies = true_places(scene)[0][0]
     pick = grid.to_pixel(lies[:2])
-    far = segment(observation).fixture
+    segmentation = segment(observation)
+    far = segmentation.fixture
     away = np.argwhere(~far)[np.linalg.norm(np.argwhere(~far) - pick, axis=1).argmax()]
-    assert (
-        refine_place(
-            segment(observation),
-            pick,
-            0.3,
-            away.astype(float),
-            grid.resolution,
-            segment(observation).unfilled_recesses,
-        )
-        is None
-    )
+    start = pick, 0.3, away.astype(float), grid.resolution
+    assert refine_place(segmentation, *start, segmentation.unfilled_recesses) is None
 
 
 def test_unseen_pixels_take_the_lowest_neighbouring_height():
