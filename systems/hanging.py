@@ -7,7 +7,7 @@ feels still changes.
 
 from systems.planner_state import PlannerState
 
-_TOLERANCE, _LEAST_TOLERANCE = 0.12, 0.3
+_TOLERANCE, _LEAST_TOLERANCE = 0.12, 0.2
 """The felt weight counts as changed if two samples in a row differ from its earlier value by more
 than this fraction of it, and by more than `_LEAST_TOLERANCE`, in N. A single sample is wrong when
 the hand begins to brake."""

@@ -39,6 +39,10 @@ _STILL, _LONGEST_CHECK = 0.002, 0.4
 an object that leans or lies askew yields for a while."""
 _FIXED = 20.0
 """If the closed jaws feel a lateral force above this at rest, in N, they grip something fixed."""
+_SLIPS = 0.1
+"""If the jaws close faster than this in `LIFT`, in m/s, the pads slip off the object."""
+_YIELDS = 0.005
+"""A hand that is pushed up while it should let go rises by this distance, in m."""
 _LEAST_SINK = 0.001
 """There is no search for a cavity into which the object could sink by less than this, in m."""
 _CARRIED = 0.5
@@ -183,6 +187,9 @@ class PickPlaceSteps:
         retreats, holds = state.mode == Mode.RETREAT, state.mode in _HOLDING
         following = Mode.RELEASE if holds else Mode.RETREAT
         self._motion.begin(state, following, moment.time, at=moment.hand[:4])
+        if holds and moment.contact[2] > self._parameters.contact_threshold:
+            # The jaws may be wedged under an object, or it may tip up as they open.
+            self._motion.back_off(state, _YIELDS)
         if retreats:
             # A force during the retreat means that the jaws drag something: open them fully.
             state.goal_opening = self._parameters.open_width
@@ -331,7 +338,8 @@ class PickPlaceSteps:
         if state.mode == Mode.LIFT and lifts_too_early(force, self._motion.force_at(state, time)):
             # Brake, and continue when the grip is firm.
             self._motion.begin(state, Mode.LIFT, time)
-        if not self._is_held(hand, contact):
+        slips = state.mode == Mode.LIFT and hand[10] + hand[11] < -_SLIPS
+        if slips or not self._is_held(hand, contact):
             self._lose(moment)
         elif state.mode == Mode.LIFT:
             if self._motion.brakes_above(state, time, state.travel_z):
