@@ -25,8 +25,8 @@ from systems.floating_hand_motion import HandMotion
 from systems.hand_geometry import check_reach
 from systems.motion_heights import motion_heights
 from systems.pick_place_parameters import Mode, PickPlaceParameters
-from systems.pick_place_steps import Moment, PickPlaceSteps
-from systems.planner_state import PlannerState
+from systems.pick_place_steps import PickPlaceSteps
+from systems.planner_state import Moment, PlannerState
 from systems.robot_motion import RobotMotion
 from systems.signals import (
     STOP_REASONS,
@@ -128,7 +128,9 @@ class PickPlacePlanner(LeafSystem):
       contains the estimated centre of mass, so that a policy can grip the object there.
       An object that leaves the table late hangs lower than it lay, because it turned or another
       object is caught in it; it is lifted and carried higher by half as much again (`hanging`).
-    - `RELEASE`: if the jaws stick to the object, they open with force.
+    - `LIFT`: if the jaws suddenly close, the pads slip off the object. The hand then lets go.
+    - `RELEASE`: if the jaws stick to the object, they open with force. If a force from below ended
+      the action, the hand rises by 5 mm as they open.
     - `RETREAT`: if an object still hangs on the hand as it rises, the hand brakes (`RELEASE`),
       lowers the object (`LOWER`) and moves its jaws (`RELEASE`), twice at most in an action.
     - `SEARCH`: in tasks that insert objects into cavities, if the object stands on the rim around

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +21,9 @@ from systems.grip_force import (
     turns_in_the_pads,
 )
 from systems.hanging import begin_lift, feel_weight, lift_higher
+from systems.letting_go import STUCK, LettingGo
 from systems.pick_place_parameters import Mode, PickPlaceParameters
-from systems.planner_state import PlannerState, Z
+from systems.planner_state import Moment, PlannerState, Z
 from systems.robot_motion import RobotMotion
 
 _HOLDING = (Mode.CHECK, Mode.LIFT, Mode.CARRY, Mode.LOWER, Mode.SEARCH, Mode.RELEASE)
@@ -45,45 +45,10 @@ _YIELDS = 0.005
 """A hand that is pushed up while it should let go rises by this distance, in m."""
 _LEAST_SINK = 0.001
 """There is no search for a cavity into which the object could sink by less than this, in m."""
-_CARRIED = 0.5
-"""If something pulls the rising hand down with more than this, in N, the hand still carries an
-object."""
-_FELT_FOR = 1 / 32
-"""The pull must last for this time, in s."""
-_LEAST_RISE, _MOST_RISE = 0.02, 0.15
-"""The pull counts if the hand has risen by more than the first length, in m, because below it the
-hand may brush against the object. The hand goes down again if it has risen by less than the
-second."""
-_MOST_LAYINGS = 2
-"""How often the hand goes down again to rid itself of an object."""
-_STUCK = 0.004
-"""If the opening of the jaws stays below its goal by more than this, in m, they stick to the
-object."""
-_PUSH = 1 / 3
-"""The force that pushes sticking jaws open, as a share of the grasp force. It is added to the force
-with which the jaws follow their command."""
-_LONGEST_RELEASE = 1.0
-"""After this time, in s, the hand rises even if the jaws stick."""
 _RISES = 0.02
 """The hand counts as rising if its vertical speed is above this, in m/s."""
 _RISEN = 0.0005
 """The hand counts as lifted when it is this far, in m, above its height at the grip."""
-
-
-@dataclass(slots=True)
-class Moment:
-    """The inputs of one step of the state machine."""
-
-    state: PlannerState
-    """The planner's state, which the step modifies."""
-    time: float
-    hand: NDArray[np.float64]
-    """(12) value of the planner's port `hand_state`."""
-    contact: NDArray[np.float64]
-    """(6) value of the planner's port `hand_contact_force`."""
-    wrist_moment: float | None = None
-    """Value of the planner's port `wrist_moment`, in N m; None if it is not connected or
-    the mode is not `LIFT`."""
 
 
 class PickPlaceSteps:
@@ -106,6 +71,7 @@ class PickPlaceSteps:
         self._parameters, self._motion, self._guard = parameters, motion, guard
         self._search_steps = search_steps
         self._settle = min(parameters.tare_settle, motion.settles)
+        self._letting_go = LettingGo(parameters, motion, self._settle)
         self._steps = {
             Mode.DESCEND: self.descend,
             Mode.CLOSE: self.close,
@@ -140,44 +106,7 @@ class PickPlaceSteps:
         elif state.mode in (Mode.DESCEND, Mode.LOWER):
             self.step(moment)
         elif state.mode == Mode.RETREAT:
-            self._feel_load(moment)
-
-    def _feel_load(self, moment: Moment) -> None:
-        """Goes down again if an object that should have been let go still hangs on the hand."""
-        state, time = moment.state, moment.time
-        risen = moment.hand[2] - state.let_go_z
-        if moment.contact[2] > -_CARRIED or risen < _LEAST_RISE:
-            state.carries_since = np.inf
-            return
-        state.carries_since = min(float(state.carries_since), time)
-        lasts = time - state.carries_since >= _FELT_FOR and risen < _MOST_RISE
-        if lasts and state.layings < _MOST_LAYINGS and not state.stops and not state.press:
-            state.layings += 1
-            # Brake first.
-            state.lowers_next = 1
-            self._motion.begin(state, Mode.RELEASE, time)
-            state.goal_opening = state.start_opening
-
-    def _lower_again(self, moment: Moment) -> None:
-        """Begins to lower an object that hangs on the resting hand. It hangs by an unknown length,
-        so the hand moves slowly and stops at the first contact."""
-        state = moment.state
-        state.lowers_next = 0
-        state.payload = min(float(moment.contact[2]), 0.0)
-        state.floor_z, state.rim_z = state.travel_z, state.table_z
-        state.place_hover_z = float(moment.hand[2]) + self._parameters.hover_clearance
-        self._motion.begin(state, Mode.LOWER, moment.time)
-
-    def _lay_down(self, moment: Moment) -> None:
-        """Lets go of an object that hung on the hand, after it was lowered again.
-
-        The jaws open fully. The second time they close half of the way instead, because a finger
-        may be wedged between two parts of the object.
-        """
-        state, opening = moment.state, float(moment.hand[4] + moment.hand[5])
-        self._motion.begin(state, Mode.RELEASE, moment.time, opening=opening)
-        first = state.layings == 1
-        state.goal_opening = self._parameters.open_width if first else opening / 2
+            self._letting_go.feel_load(moment)
 
     def stop(self, moment: Moment) -> None:
         """Stops the hand at once, lets go of the object in it, and retreats."""
@@ -359,7 +288,7 @@ class PickPlaceSteps:
         """
         state, opening = moment.state, float(moment.hand[4] + moment.hand[5])
         state.dropped += 1
-        kept = max(opening, 0.0) if opening < _STUCK else None
+        kept = max(opening, 0.0) if opening < STUCK else None
         self._motion.begin(state, Mode.RETREAT, moment.time, opening=kept)
 
     def _hangs_lower(self, moment: Moment, weight: float) -> bool:
@@ -394,7 +323,7 @@ class PickPlaceSteps:
         if state.layings:
             touches = state.recent[Z] > self._parameters.contact_threshold
             if touches or time >= self._motion.arrival(state):
-                self._lay_down(moment)
+                self._letting_go.lay_down(moment)
         elif not self._is_held(hand, contact):
             self._lose(moment)
         elif state.recent[Z] > self._parameters.contact_threshold:
@@ -423,24 +352,9 @@ class PickPlaceSteps:
                 self._motion.begin(state, Mode.RELEASE, time, z=hand[2])
 
     def release(self, moment: Moment) -> None:
-        """Opens the jaws, with force if they stick, and goes on when they have opened."""
-        state, time, hand = moment.state, moment.time, moment.hand
-        opening = hand[4] + hand[5]
-        if state.lowers_next:
-            if time >= self._motion.arrival(state) + self._settle:
-                self._lower_again(moment)
-        elif state.layings > 1:
-            # Jaws that close must not clamp what is between them.
-            if time >= self._motion.arrival(state):
-                kept = max(float(opening), float(state.goal_opening))
-                self._motion.begin(state, Mode.RETREAT, time, opening=kept)
-        elif opening >= state.goal_opening - _STUCK or time < self._motion.arrival(state):
+        """Opens the jaws, and goes on when they have opened."""
+        if self._letting_go.release(moment):
             self.follow(moment)
-        elif time < state.start_time + _LONGEST_RELEASE:
-            self._motion.set_force(state, time, -_PUSH * self._parameters.grasp_force)
-        else:
-            # The fingers may be jammed in a cavity: do not press against its walls on the way up.
-            self._motion.begin(state, Mode.RETREAT, time, opening=opening)
 
     def _is_blocked(self, state: PlannerState, hand: NDArray[np.float64]) -> bool:
         """Whether the object stands on the rim of a cavity, and can sink in before the fingertips

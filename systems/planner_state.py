@@ -1,5 +1,12 @@
 """The state of the pick-and-place motion primitive."""
 
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
 from systems.motion_heights import MotionHeights
 from systems.signals import SurfaceHeights
 from systems.vector_view import Array, Number, VectorView
@@ -151,3 +158,19 @@ class PlannerState(VectorView):
         self.width = surfaces.width
         self.clear_z, self.travel_z = motion.clear, motion.travel
         self.pick_hover_z, self.place_hover_z = motion.pick_hover, motion.place_hover
+
+
+@dataclass(slots=True)
+class Moment:
+    """The inputs of one step of the state machine."""
+
+    state: PlannerState
+    """The planner's state, which the step modifies."""
+    time: float
+    hand: NDArray[np.float64]
+    """(12) value of the planner's port `hand_state`."""
+    contact: NDArray[np.float64]
+    """(6) value of the planner's port `hand_contact_force`."""
+    wrist_moment: float | None = None
+    """Value of the planner's port `wrist_moment`, in N m; None if it is not connected or
+    the mode is not `LIFT`."""

@@ -62,6 +62,7 @@ class World:
         leaves: the height above the grasp up to which the table bears half of the object's weight,
             in m.
         sticks: whether the jaws stick at the release, until a force opens them.
+        slips: the speed, in m/s, at which the jaws close in `LIFT` in the first attempt.
     """
 
     touch_pick: float = NO_TOUCH
@@ -72,6 +73,7 @@ class World:
     levers: tuple[float, ...] = ()
     leaves: float = 0.0
     sticks: bool = False
+    slips: float = 0.0
 
 
 @dataclasses.dataclass
@@ -123,6 +125,8 @@ class PerfectHand(LeafSystem):
         sticks = self._world.sticks and releases and not is_pushed_open
         if opening < self._width(context) or sticks:
             opening, rate = self._width(context), 0.0
+        if self._eval(context, "mode")[0] == Mode.LIFT and self._eval(context, "counts")[0] == 1:
+            rate -= self._world.slips
         fingers, rates = [opening / 2] * 2, [rate / 2] * 2
         output.SetFromVector(np.concatenate([q, fingers, v, rates]))
 
@@ -732,6 +736,13 @@ def test_a_dropped_object_is_counted_and_retried(where: Mode):
     assert run.counts == [2, 0, 1]
 
 
+@pytest.mark.parametrize(("speed", "is_lost"), [(0.15, True), (0.05, False)])
+def test_pads_that_slip_off_the_lifted_object_let_go(speed: float, is_lost: bool):
+    run = Run(World(slips=speed), actions=2).finish()
+    assert run.counts == [2, 0, float(is_lost)]
+    assert (Mode.CARRY in run.sequence[: run.sequence.index(Mode.RETREAT)]) == (not is_lost)
+
+
 def test_max_actions():
     parameters = dataclasses.replace(PARAMETERS, max_actions=2)
     run = Run(World(width=lambda attempt, mode: 0.0), actions=100, parameters=parameters).finish()
@@ -876,6 +887,15 @@ def test_a_contact_force_beyond_the_limit_stops_the_action(mode: Mode, force: tu
     assert Mode(int(where)) == mode
     assert max(vertical, lateral) == attempt.peak_force
     assert run.output("failed_picks") == (PICK,)
+
+
+@pytest.mark.parametrize(("force", "rise"), [(PUSH, 0.005), (LATERAL, 0.0)])
+def test_a_hand_that_is_pushed_up_rises_while_it_lets_go(force: tuple, rise: float):
+    run = Run(Jam(mode=Mode.CHECK, force=force, stiffness=SOFT), parameters=GUARDED)
+    before = run.until(Mode.RELEASE).output("desired_motion")[2]
+    assert run.until(Mode.RETREAT).output("desired_motion")[2] - before == pytest.approx(
+        rise, abs=1e-3
+    )
 
 
 @pytest.mark.parametrize("force", [(0.0, 29.0, 0.0), (0.0, 0.0, 0.0)])
