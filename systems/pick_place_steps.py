@@ -189,6 +189,9 @@ class PickPlaceSteps:
     def lift(self, moment: Moment) -> None:
         """Lifts the object. Sets it down again if it would turn between the pads."""
         state, time = moment.state, moment.time
+        if moment.hand[10] + moment.hand[11] < -_SLIPS:
+            self._lose(moment)
+            return
         desired = self._motion.motion_at(state, time)
         acceleration = float(self._motion.hand_acceleration(state, time, desired)[Z])
         weight = felt_weight(moment.contact[2], acceleration)
@@ -267,8 +270,7 @@ class PickPlaceSteps:
         if state.mode == Mode.LIFT and lifts_too_early(force, self._motion.force_at(state, time)):
             # Brake, and continue when the grip is firm.
             self._motion.begin(state, Mode.LIFT, time)
-        slips = state.mode == Mode.LIFT and hand[10] + hand[11] < -_SLIPS
-        if slips or not self._is_held(hand, contact):
+        if not self._is_held(hand, contact):
             self._lose(moment)
         elif state.mode == Mode.LIFT:
             if self._motion.brakes_above(state, time, state.travel_z):
