@@ -20,7 +20,12 @@ from scipy import ndimage
 
 from kitting_drake.policies.data.images import make_action
 from kitting_drake.policies.matching.inventory import Inventory
-from kitting_drake.policies.matching.jaw_clearance import jaw_grasps
+from kitting_drake.policies.matching.jaw_clearance import (
+    JawGrasp,
+    failed_pixels,
+    jaw_grasps,
+    untried,
+)
 from kitting_drake.policies.matching.regions.segmentation import Mask, Region, Segmentation
 from kitting_drake.policies.matching.separating import (
     separating_action,
@@ -42,7 +47,7 @@ _BELOW = 0.0015
 _FAR = 0.75
 """The far end of an object begins at this share of its largest distance from the grip."""
 _TRIED = 0.020
-"""Presses or grasps closer together than this, in metres, count as the same."""
+"""Presses closer together than this, in metres, count as the same."""
 _NEARBY = 12
 """The height of the fixture's top is measured within this many pixels of an object."""
 _ROOM = 0.045
@@ -168,13 +173,13 @@ def _take_out(
     free = _free_place(segmentation, resolution)
     if free is None:
         return None
-    top = _top_around(segmentation, region)
     # If the region is several entangled objects, often only the topmost can be gripped.
     for part in (region, *topmost_layers(segmentation, region)):
-        for grasp in jaw_grasps(segmentation, part, resolution, planner, support=top):
+        grasps = _untried_grasps(inventory, region, part, planner, tried)
+        if grasps and not inventory.memory.was_removed(part):
+            grasp = grasps[0]
             action = make_action(observation, grasp.pixel, grasp.theta, free, 0.0)
-            if not _is_near(action.pick, tried) and not inventory.memory.was_removed(part):
-                return replace(action, aside=True)
+            return replace(action, aside=True)
     return None
 
 
@@ -186,17 +191,31 @@ def _move_to_place(
 ) -> PickPlaceAction | None:
     """Returns an action that moves a protruding object to the place from which it is off by a
     distance in the range `_BESIDE`; None if there is no such action."""
-    observation, segmentation = inventory.observation, inventory.segmentation
+    observation = inventory.observation
     resolution = observation.grid.resolution
     off = inventory.memory.misplacement(region)
     if off is None or not _BESIDE[0] < np.linalg.norm(off) * resolution < _BESIDE[1]:
         return None
-    top = _top_around(segmentation, region)
-    for grasp in jaw_grasps(segmentation, region, resolution, planner, support=top):
-        action = make_action(observation, grasp.pixel, grasp.theta, grasp.pixel - off, 0.0)
-        if not _is_near(action.pick, tried):
-            return action
+    for grasp in _untried_grasps(inventory, region, region, planner, tried)[:1]:
+        return make_action(observation, grasp.pixel, grasp.theta, grasp.pixel - off, 0.0)
     return None
+
+
+def _untried_grasps(
+    inventory: Inventory,
+    region: Region,
+    part: Region,
+    planner: PickPlaceParameters,
+    tried: Sequence[PlanarPose],
+) -> list[JawGrasp]:
+    """Returns the feasible grasps of a part of a protruding region that have not failed yet, best
+    first. A press at the same point does not count."""
+    observation, segmentation = inventory.observation, inventory.segmentation
+    presses = [item.action.pick for item in observation.history if item.action.press]
+    failed = failed_pixels(observation.grid, [pick for pick in tried if pick not in presses])
+    resolution, top = observation.grid.resolution, _top_around(segmentation, region)
+    grasps = jaw_grasps(segmentation, part, resolution, planner, support=top)
+    return untried(grasps, failed, resolution)
 
 
 def _top_around(segmentation: Segmentation, region: Region) -> float:
