@@ -311,8 +311,8 @@ class Recovery:
 
     If the networks find no grasp of an object that fits into a recess, the outlines may find one
     (`best_insertion`). It presses a protruding object down at once, and moves it or takes it out if
-    the next object needs its place (`Inventory.needs_clearing`). The other corrections take several
-    actions, so they come only when no object fits into a recess.
+    the next object needs its place (`Inventory.needs_clearing`). The other corrections take
+    several actions, so they come only when the networks stop or pick from a heap.
     """
 
     planner: PickPlaceParameters
@@ -327,7 +327,8 @@ class Recovery:
             action = make_action(look.observation, *poses)
             first = mending is not None and look.inventory.needs_clearing(action)
             return dataclasses.replace(draft, mending=mending) if first else draft
-        if draft.stop:
+        # Of a heap, the networks would place whatever lies on top.
+        if draft.stop or look.inventory.is_heap(draft.pick):
             arguments = look.inventory, self.planner, look.failed_picks
             # The networks' grasp may lack room where another grasp of the object has room.
             inserted, _ = best_insertion(*arguments)

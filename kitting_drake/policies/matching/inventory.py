@@ -25,6 +25,8 @@ _PROUD = 0.003
 rise 1 mm above the kit, and strict success allows 2 mm more."""
 _MOST_TRIES = 3
 """The largest number of actions on one object."""
+_MOST_ASIDES = 2
+"""How often an object that fits into no recess is laid aside."""
 _BESIDE = 3
 """Regions that are at most this many pixels apart touch each other."""
 _LEANS = 6
@@ -39,6 +41,8 @@ reach. A leaning or partly hidden object looks shorter than its recess."""
 _SEVERAL = 0.75
 """A region that may contain several objects has at least this share of the total area of as many
 open recesses, the largest ones."""
+_LARGER = 1.2
+"""A region that is larger by this factor than every open recess is several objects."""
 _LARGEST_SHARE = 1.6
 """A region of objects for open recesses has at most this multiple of these recesses' total area."""
 
@@ -186,18 +190,30 @@ class Inventory:
     def is_tried(self, region: Region | None) -> bool:
         """Whether the objects of a region were tried often enough. For None the result is False.
 
-        `_MOST_TRIES` actions on one object are enough. A region that fits into no recess is not
-        tried once more if all objects that it can contain were laid there before, it is seen whole
-        and it touches no other region, which may hide a part of it.
+        `_MOST_TRIES` actions on one object are enough. An object that fits into no recess is laid
+        aside at most `_MOST_ASIDES` times. A region that fits into no recess is not tried once more
+        if all objects that it can contain were laid there before, it is seen whole and it touches
+        no other region, which may hide a part of it.
         """
         if region is None:
             return False
         fits_nowhere = self.pair_of(region) is None and not self.is_reversed(region)
+        if fits_nowhere and self.memory.asides(region) >= _MOST_ASIDES:
+            return True
         laid = sum(moves[-1].outcome == "placed" for moves in self.memory.moves_of(region))
         is_whole = not self._is_cut(region) and not self._may_contain(region, laid + 1)
         if fits_nowhere and laid and is_whole:
             return self._is_alone(region) or self.memory.tries(region) >= _MOST_TRIES
         return self.memory.tries(region) >= _MOST_TRIES
+
+    def is_heap(self, pixel: NDArray[np.float64]) -> bool:
+        """Whether the region at a pixel (row, col) is one that is `worth_a_try`, and is larger or
+        longer than every open recess, so it is several objects."""
+        region = nearest_region(self.segmentation.objects, pixel)
+        if region is None or not any(item is region for item in self.worth_a_try):
+            return False
+        area, reach = region.mask.sum() / _LARGER, region.reach / _LARGER
+        return not any(it.mask.sum() >= area and it.reach >= reach for it in self.open_recesses)
 
     def named(self, action: PickPlaceAction) -> PickPlaceAction:
         """Returns an action with the middle and the spread of the object that it picks, if it picks

@@ -165,6 +165,12 @@ class Memory:
         ]
         return len(here) - (here.count("set down") + 1) // 2
 
+    def asides(self, region: Region) -> int:
+        """Returns how often the object in a region was laid aside, from the table to the table. Of
+        several objects, the one that was left there last counts."""
+        done = (it.action for it in (self.moves_of(region) or [[]])[-1] if it.outcome == "placed")
+        return sum(it.aside and not self.is_on_fixture(it.pick) for it in done)
+
     def was_removed(self, region: Region) -> bool:
         """Whether earlier actions took the object in a region out of the kit, and then placed it
         there again, or took out `_MOST_REMOVALS` objects there."""
