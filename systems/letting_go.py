@@ -1,4 +1,4 @@
-"""Lets go of the object in the hand, and notices if it is not rid of it."""
+"""Lets go of the object in the hand, and notices if it still hangs on the hand."""
 
 from __future__ import annotations
 

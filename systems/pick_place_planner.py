@@ -128,9 +128,10 @@ class PickPlacePlanner(LeafSystem):
       contains the estimated centre of mass, so that a policy can grip the object there.
       An object that leaves the table late hangs lower than it lay, because it turned or another
       object is caught in it; it is lifted and carried higher by half as much again (`hanging`).
-    - `LIFT`: if the jaws suddenly close, the pads slip off the object. The hand then lets go.
-    - `RELEASE`: if the jaws stick to the object, they open with force. If a force from below ended
-      the action, the hand rises by 5 mm as they open.
+    - `LIFT`: if the jaws suddenly close, the pads slip off the object. The hand then
+      retreats with opening jaws, and the object counts as dropped.
+    - `RELEASE`: if the jaws stick to the object, they open with force. If a force ended the
+      action and something pushes the hand up, it rises by 5 mm as they open.
     - `RETREAT`: if an object still hangs on the hand as it rises, the hand brakes (`RELEASE`),
       lowers the object (`LOWER`) and moves its jaws (`RELEASE`), twice at most in an action.
     - `SEARCH`: in tasks that insert objects into cavities, if the object stands on the rim around
@@ -320,8 +321,9 @@ class PickPlacePlanner(LeafSystem):
             outcome = _outcome(before, state)
             balance = _balance(state) if outcome == "set down" else None
             top = _top(state) if outcome == "placed" else None
-            # A trial lift that is given up has replaced the floor's height.
-            floor = None if state.press or state.doubts_grip else float(state.floor_z)
+            # An object that is set down after a trial lift has replaced the floor's height.
+            replaced = state.doubts_grip and before != Mode.LIFT
+            floor = None if state.press or replaced else float(state.floor_z)
             history.append(_action_of(state), outcome, _peak(state), balance, top, floor)
             state.free_actions += outcome == "set down"
 

@@ -116,7 +116,7 @@ class PickPlaceSteps:
         retreats, holds = state.mode == Mode.RETREAT, state.mode in _HOLDING
         following = Mode.RELEASE if holds else Mode.RETREAT
         self._motion.begin(state, following, moment.time, at=moment.hand[:4])
-        if holds and moment.contact[2] > self._parameters.contact_threshold:
+        if holds and state.recent[Z] > self._parameters.contact_threshold:
             # The jaws may be wedged under an object, or it may tip up as they open.
             self._motion.back_off(state, _YIELDS)
         if retreats:

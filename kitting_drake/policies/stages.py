@@ -20,6 +20,7 @@ from kitting_drake.policies.matching.refinement import nearest_region, refine_gr
 from kitting_drake.policies.matching.regions.segmentation import Region
 from kitting_drake.policies.matching.regions.visibility import Visibility
 from kitting_drake.policies.matching.release_clearance import blocked_at_place
+from kitting_drake.policies.matching.separating import separating_action
 from kitting_drake.policies.matching.shape_matching import best_insertion
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import wrap_to_pi
@@ -311,8 +312,9 @@ class Recovery:
 
     If the networks find no grasp of an object that fits into a recess, the outlines may find one
     (`best_insertion`). It presses a protruding object down at once, and moves it or takes it out if
-    the next object needs its place (`Inventory.needs_clearing`). The other corrections take
-    several actions, so they come only when the networks stop or pick from a heap.
+    the next object needs its place (`Inventory.needs_clearing`). If the networks pick from a heap,
+    it is taken apart, if possible. The other corrections take several actions, so they come only
+    when no object fits into a recess.
     """
 
     planner: PickPlaceParameters
@@ -327,13 +329,17 @@ class Recovery:
             action = make_action(look.observation, *poses)
             first = mending is not None and look.inventory.needs_clearing(action)
             return dataclasses.replace(draft, mending=mending) if first else draft
-        # Of a heap, the networks would place whatever lies on top.
-        if draft.stop or look.inventory.is_heap(draft.pick):
-            arguments = look.inventory, self.planner, look.failed_picks
+        arguments = look.inventory, self.planner, look.failed_picks
+        if draft.stop:
             # The networks' grasp may lack room where another grasp of the object has room.
             inserted, _ = best_insertion(*arguments)
             if inserted is not None:
                 first = mending is not None and look.inventory.needs_clearing(inserted.action)
                 return dataclasses.replace(draft, mending=mending if first else inserted.action)
             mending = preparing_action(*arguments, mending)
+        elif look.inventory.is_heap(draft.pick) and (
+            mending is None or look.inventory.leans(mending.pick)
+        ):
+            # The networks would place whatever lies on top.
+            mending = separating_action(*arguments) or mending
         return dataclasses.replace(draft, mending=mending)

@@ -42,7 +42,7 @@ _SEVERAL = 0.75
 """A region that may contain several objects has at least this share of the total area of as many
 open recesses, the largest ones."""
 _LARGER = 1.2
-"""A region that is larger by this factor than every open recess is several objects."""
+"""A region counts as several objects if every open recess is smaller or shorter by this factor."""
 _LARGEST_SHARE = 1.6
 """A region of objects for open recesses has at most this multiple of these recesses' total area."""
 
@@ -197,18 +197,19 @@ class Inventory:
         """
         if region is None:
             return False
-        fits_nowhere = self.pair_of(region) is None and not self.is_reversed(region)
-        if fits_nowhere and self.memory.asides(region) >= _MOST_ASIDES:
+        memory = self.memory
+        if memory.tries(region) >= _MOST_TRIES:
             return True
-        laid = sum(moves[-1].outcome == "placed" for moves in self.memory.moves_of(region))
-        is_whole = not self._is_cut(region) and not self._may_contain(region, laid + 1)
-        if fits_nowhere and laid and is_whole:
-            return self._is_alone(region) or self.memory.tries(region) >= _MOST_TRIES
-        return self.memory.tries(region) >= _MOST_TRIES
+        fits_nowhere = self.pair_of(region) is None and not self.is_reversed(region)
+        laid = sum(moves[-1].outcome == "placed" for moves in memory.moves_of(region))
+        if not fits_nowhere or not laid or self._may_contain(region, laid + 1):
+            return False
+        is_whole = not self._is_cut(region) and self._is_alone(region)
+        return is_whole or memory.asides(region) >= _MOST_ASIDES
 
     def is_heap(self, pixel: NDArray[np.float64]) -> bool:
-        """Whether the region at a pixel (row, col) is one that is `worth_a_try`, and is larger or
-        longer than every open recess, so it is several objects."""
+        """Whether the region at a pixel (row, col) is `worth_a_try` but too large or too long for
+        each open recess. It is probably several objects."""
         region = nearest_region(self.segmentation.objects, pixel)
         if region is None or not any(item is region for item in self.worth_a_try):
             return False

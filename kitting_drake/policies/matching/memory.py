@@ -166,10 +166,12 @@ class Memory:
         return len(here) - (here.count("set down") + 1) // 2
 
     def asides(self, region: Region) -> int:
-        """Returns how often the object in a region was laid aside, from the table to the table. Of
-        several objects, the one that was left there last counts."""
+        """Returns how often the object in a region was laid aside. Of several objects, the one that
+        was left there last counts. Taking it out of the kit, or turning it over the kit's edge,
+        does not count."""
         done = (it.action for it in (self.moves_of(region) or [[]])[-1] if it.outcome == "placed")
-        return sum(it.aside and not self.is_on_fixture(it.pick) for it in done)
+        near = self._is_near_fixture
+        return sum(it.aside and not near(it.pick) and not near(it.place) for it in done)
 
     def was_removed(self, region: Region) -> bool:
         """Whether earlier actions took the object in a region out of the kit, and then placed it
@@ -282,6 +284,11 @@ class Memory:
             return False
         row, col = np.rint(grid.to_pixel((pose.x, pose.y))).astype(int)
         return bool(self.segmentation.fixture[row, col])
+
+    def _is_near_fixture(self, pose: PlanarPose) -> bool:
+        grid, pixels = self.observation.grid, np.argwhere(self.segmentation.fixture)
+        away = np.linalg.norm(pixels - grid.to_pixel((pose.x, pose.y)), axis=1)
+        return bool(away.min(initial=np.inf) * grid.resolution < _THERE)
 
     def _last_but(self, ignored: Sequence[str]) -> tuple[Attempt, ...]:
         """The last action on each object, apart from actions with some outcomes."""

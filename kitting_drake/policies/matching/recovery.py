@@ -21,6 +21,7 @@ from scipy import ndimage
 from kitting_drake.policies.data.images import make_action
 from kitting_drake.policies.matching.inventory import Inventory
 from kitting_drake.policies.matching.jaw_clearance import (
+    RETRY_DISTANCE,
     JawGrasp,
     failed_pixels,
     jaw_grasps,
@@ -47,7 +48,9 @@ _BELOW = 0.0015
 _FAR = 0.75
 """The far end of an object begins at this share of its largest distance from the grip."""
 _TRIED = 0.020
-"""Presses closer together than this, in metres, count as the same."""
+"""An object is not pressed closer than this to an earlier press or failed grasp, in metres."""
+_MOST_FAILURES = 3
+"""An object is not gripped again after this many failed grasps."""
 _NEARBY = 12
 """The height of the fixture's top is measured within this many pixels of an object."""
 _ROOM = 0.045
@@ -196,9 +199,11 @@ def _move_to_place(
     off = inventory.memory.misplacement(region)
     if off is None or not _BESIDE[0] < np.linalg.norm(off) * resolution < _BESIDE[1]:
         return None
-    for grasp in _untried_grasps(inventory, region, region, planner, tried)[:1]:
-        return make_action(observation, grasp.pixel, grasp.theta, grasp.pixel - off, 0.0)
-    return None
+    grasps = _untried_grasps(inventory, region, region, planner, tried)
+    if not grasps:
+        return None
+    best = grasps[0]
+    return make_action(observation, best.pixel, best.theta, best.pixel - off, 0.0)
 
 
 def _untried_grasps(
@@ -209,11 +214,14 @@ def _untried_grasps(
     tried: Sequence[PlanarPose],
 ) -> list[JawGrasp]:
     """Returns the feasible grasps of a part of a protruding region that have not failed yet, best
-    first. A press at the same point does not count."""
+    first; none after `_MOST_FAILURES`. A press at the same point does not count."""
     observation, segmentation = inventory.observation, inventory.segmentation
     presses = [item.action.pick for item in observation.history if item.action.press]
     failed = failed_pixels(observation.grid, [pick for pick in tried if pick not in presses])
     resolution, top = observation.grid.resolution, _top_around(segmentation, region)
+    away = [np.linalg.norm(part.pixels - pixel, axis=1).min() for pixel in failed]
+    if sum(np.array(away) * resolution < RETRY_DISTANCE) >= _MOST_FAILURES:
+        return []
     grasps = jaw_grasps(segmentation, part, resolution, planner, support=top)
     return untried(grasps, failed, resolution)
 

@@ -116,13 +116,13 @@ def test_what_was_laid_aside_and_fits_nowhere_is_left_alone():
 @pytest.mark.parametrize("times", [1, 2])
 def test_an_object_is_laid_aside_twice_at_most(times: int):
     left, right = (np.zeros(GRID.shape, bool) for _ in range(2))
-    left[36:80, 215:226], right[80:124, 217:228] = True, True
+    left[36:80, 215:226], right[82:126, 215:226] = True, True
     first, second = (placed_at((row, 220.0)) for row in (45.0, 58.0))
     again = Attempt(PickPlaceAction(first.action.place, second.action.place, aside=True), "placed")
     history = (first, again) if times == 2 else (second,)
     seen = scene((left, 0.015), (right, 0.025))
     inventory = Inventory.of(dataclasses.replace(seen, history=history))
-    # The objects touch, so one may hide a part of the other.
+    # The objects almost touch, so one may hide a part of the other.
     region = next(it for it in inventory.segmentation.objects if it.mask[60, 220])
     assert inventory.is_tried(region) is (times == 2)
 
@@ -130,8 +130,11 @@ def test_an_object_is_laid_aside_twice_at_most(times: int):
 def test_a_region_that_is_larger_than_any_recess_is_a_heap():
     stranger = np.zeros(GRID.shape, bool)
     stranger[36:80, 215:226] = True
+    long = np.zeros(GRID.shape, bool)
+    long[20:110, 218:222] = True
     pixel = np.array([63.0, 220.0])
     assert Inventory.of(crossed()).is_heap(pixel)
+    assert Inventory.of(scene((long, 0.015))).is_heap(pixel)
     assert not Inventory.of(scene((stranger, 0.015))).is_heap(pixel)
 
 

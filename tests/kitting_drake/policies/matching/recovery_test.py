@@ -132,6 +132,7 @@ class Stopped:
     look: Any
     belongs: bool = False
     stop: bool = True
+    pick: Any = None
     mending: PickPlaceAction | None = None
 
 
@@ -144,6 +145,18 @@ def test_where_the_networks_stop_the_outlines_insert_what_fits(removed: bool):
     # After a removal, what protrudes is taken out first.
     assert (bool(is_on_object(action)), action.aside) == (removed, removed)
     assert action.pick == ShapeMatchingPolicy(PickPlaceParameters(), recover=True)(seen).pick
+
+
+@pytest.mark.parametrize(("width", "is_heap"), [(14, True), (9, False)])
+def test_a_heap_is_taken_apart_even_if_the_networks_would_pick_from_it(width: int, is_heap: bool):
+    seen = observed()
+    # The open recess has 300 pixels.
+    seen.image[3, 100:106, 220:270] = 0.0
+    seen.image[3, 40:73, 220 : 220 + width] = 0.03
+    look = SimpleNamespace(inventory=Inventory.of(seen), observation=seen, failed_picks=())
+    draft = Stopped(look, stop=False, pick=np.array([56.0, 224.0]))
+    action = Recovery(PickPlaceParameters()).refine(draft).mending
+    assert (action is not None and action.aside) is is_heap
 
 
 def test_an_object_is_known_again_wherever_it_is_gripped():
