@@ -128,7 +128,7 @@ class PickPlacePlanner(LeafSystem):
       contains the estimated centre of mass, so that a policy can grip the object there.
       An object that leaves the table late hangs lower than it lay, because it turned or another
       object is caught in it; it is lifted and carried higher by half as much again (`hanging`).
-    - `LIFT`: if the jaws suddenly close, the pads slip off the object. The hand then
+    - `LIFT`, `CARRY`: if the jaws suddenly close, the pads slip off the object. The hand then
       retreats with opening jaws, and the object counts as dropped.
     - `RELEASE`: if the jaws stick to the object, they open with force. If a force ended the
       action and something pushes the hand up, it rises by 5 mm as they open.

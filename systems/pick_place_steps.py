@@ -40,7 +40,7 @@ an object that leans or lies askew yields for a while."""
 _FIXED = 20.0
 """If the closed jaws feel a lateral force above this at rest, in N, they grip something fixed."""
 _SLIPS = 0.1
-"""If the jaws close faster than this in `LIFT`, in m/s, the pads slip off the object."""
+"""If the jaws close faster than this while they hold an object, in m/s, the pads slip off it."""
 _YIELDS = 0.005
 """A hand that is pushed up while it should let go rises by this distance, in m."""
 _LEAST_SINK = 0.001
@@ -189,7 +189,7 @@ class PickPlaceSteps:
     def lift(self, moment: Moment) -> None:
         """Lifts the object. Sets it down again if it would turn between the pads."""
         state, time = moment.state, moment.time
-        if moment.hand[10] + moment.hand[11] < -_SLIPS:
+        if self._slips(moment.hand):
             self._lose(moment)
             return
         desired = self._motion.motion_at(state, time)
@@ -270,7 +270,7 @@ class PickPlaceSteps:
         if state.mode == Mode.LIFT and lifts_too_early(force, self._motion.force_at(state, time)):
             # Brake, and continue when the grip is firm.
             self._motion.begin(state, Mode.LIFT, time)
-        if not self._is_held(hand, contact):
+        if self._slips(hand) or not self._is_held(hand, contact):
             self._lose(moment)
         elif state.mode == Mode.LIFT:
             if self._motion.brakes_above(state, time, state.travel_z):
@@ -286,12 +286,14 @@ class PickPlaceSteps:
     def _lose(self, moment: Moment) -> None:
         """Retreats without the object, which was lost.
 
-        Jaws that have closed stay closed: if they opened inside a ring, they would lift it.
+        Jaws that have closed stay closed: if they opened inside a ring, they would lift it. A hand
+        that sinks stops at once, because the object lies under it.
         """
-        state, opening = moment.state, float(moment.hand[4] + moment.hand[5])
+        state, hand, opening = moment.state, moment.hand, float(moment.hand[4] + moment.hand[5])
         state.dropped += 1
         kept = max(opening, 0.0) if opening < STUCK else None
-        self._motion.begin(state, Mode.RETREAT, moment.time, opening=kept)
+        at = hand[:4] if hand[8] < 0 else None
+        self._motion.begin(state, Mode.RETREAT, moment.time, opening=kept, at=at)
 
     def _hangs_lower(self, moment: Moment, weight: float) -> bool:
         """Whether the object proves to hang lower while the hand, in `CARRY`, still rises."""
@@ -367,6 +369,11 @@ class PickPlaceSteps:
         doubt = float(state.doubt)
         has_room = hand[2] > rim + doubt + max(_LEAST_SINK, doubt)
         return bool(left and has_room and search.is_on_rim(float(bottom), rim, table))
+
+    @staticmethod
+    def _slips(hand: NDArray[np.float64]) -> bool:
+        """Whether the jaws suddenly close."""
+        return bool(hand[10] + hand[11] < -_SLIPS)
 
     def _is_held(self, hand: NDArray[np.float64], contact: NDArray[np.float64]) -> bool:
         # A held object pushes the fingers apart, along their positive axes.

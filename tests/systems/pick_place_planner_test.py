@@ -753,6 +753,18 @@ def test_pads_that_slip_off_the_lifted_object_let_go(speed: float, levers: tuple
     assert (Mode.CARRY in run.sequence[: run.sequence.index(Mode.RETREAT)]) == (not is_lost)
 
 
+def test_a_hand_that_sinks_stops_at_once_when_the_object_is_lost():
+    held = [True]
+    run = Run(World(width=lambda attempt, mode: WIDTH if held[0] else 0.0)).until(Mode.LOWER)
+    while run.output("desired_motion")[6] > -0.1:
+        run.simulator.AdvanceTo(run.simulator.get_context().get_time() + 1 / 128)
+    held[0] = False
+    lowest = run.until(Mode.RETREAT).output("desired_motion")[2]
+    for _ in range(8):
+        run.simulator.AdvanceTo(run.simulator.get_context().get_time() + 1 / 128)
+        assert run.output("desired_motion")[2] >= lowest
+
+
 def test_max_actions():
     parameters = dataclasses.replace(PARAMETERS, max_actions=2)
     run = Run(World(width=lambda attempt, mode: 0.0), actions=100, parameters=parameters).finish()
