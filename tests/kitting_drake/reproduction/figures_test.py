@@ -259,10 +259,11 @@ def test_the_sentences_on_robustness(runs: dict[str, Summary]):
         "insertion blocked": 1,
     }
     assert sum(run["ambiguous"]["reversed"] for run in lost) == 7
-    late = [runs[f"robust_all_generalist_{seed}"] for seed in (90000, 92000, 94000, 96000)]
+    late = [runs[f"robust_all_generalist_{seed}"] for seed in range(90000, 103000, 2000)]
     good, objects = counts(late)
     reversed_ones = sum(run["ambiguous"]["reversed"] for run in late)
-    assert f"{reversed_ones} of the {objects - good} lost tools are offset" in text
+    assert f"together {100 * good / objects:.1f} %" in text
+    assert f"{reversed_ones} of their {objects - good} lost tools are offset" in text
     times = rows(page, "### How long it takes")[2:]
     for row, kind in zip(times, ("none", "depth_noise", "all"), strict=True):
         seconds = [
