@@ -15,12 +15,15 @@ from numpy.typing import NDArray
 from kitting_drake.policies.data.images import make_action
 from kitting_drake.policies.draft import Draft, Stage, expected_position
 from kitting_drake.policies.matching.inventory import mask_of
-from kitting_drake.policies.matching.recovery import preparing_action, recovery_action
+from kitting_drake.policies.matching.recovery import (
+    clearing_action,
+    preparing_action,
+    recovery_action,
+)
 from kitting_drake.policies.matching.refinement import nearest_region, refine_grasp, refine_place
 from kitting_drake.policies.matching.regions.segmentation import Region
 from kitting_drake.policies.matching.regions.visibility import Visibility
 from kitting_drake.policies.matching.release_clearance import blocked_at_place
-from kitting_drake.policies.matching.separating import separating_action
 from kitting_drake.policies.matching.shape_matching import best_insertion
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import wrap_to_pi
@@ -337,9 +340,7 @@ class Recovery:
                 first = mending is not None and look.inventory.needs_clearing(inserted.action)
                 return dataclasses.replace(draft, mending=mending if first else inserted.action)
             mending = preparing_action(*arguments, mending)
-        elif look.inventory.is_heap(draft.pick) and (
-            mending is None or look.inventory.leans(mending.pick)
-        ):
+        elif look.inventory.is_heap(draft.pick):
             # The networks would place whatever lies on top.
-            mending = separating_action(*arguments) or mending
+            mending = clearing_action(*arguments, mending)
         return dataclasses.replace(draft, mending=mending)

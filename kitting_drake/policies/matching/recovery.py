@@ -104,14 +104,25 @@ def preparing_action(
         tried: gripper poses of earlier failed grasps and presses.
         mending: the result of `recovery_action`.
     """
-    if mending is not None and not inventory.leans(mending.pick):
-        return mending
     return (
-        separating_action(inventory, planner, tried)
-        or mending
+        clearing_action(inventory, planner, tried, mending)
         or _press_jammed(inventory, tried)
         or turning_action(inventory, planner, tried)
     )
+
+
+def clearing_action(
+    inventory: Inventory,
+    planner: PickPlaceParameters,
+    tried: Sequence[PlanarPose],
+    mending: PickPlaceAction | None,
+) -> PickPlaceAction | None:
+    """Returns an action that mends what protrudes or takes a heap apart, in this order unless what
+    protrudes may lean on the kit; None if there is nothing to do. The arguments are those of
+    `preparing_action`."""
+    if mending is not None and not inventory.leans(mending.pick):
+        return mending
+    return separating_action(inventory, planner, tried) or mending
 
 
 def _press_jammed(inventory: Inventory, tried: Sequence[PlanarPose]) -> PickPlaceAction | None:
