@@ -10,10 +10,12 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cache
+from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,8 +28,12 @@ from systems.signals import Observation
 if TYPE_CHECKING:
     from kitting_drake.policies.learned_policy import Decision
 
+Item = TypeVar("Item")
+
 FILE = MODELS / "policies" / "confidence.json"
 """The file of the fitted regressions, one for each kind of policy."""
+MOST_PROPOSALS = 3
+"""A policy that is not sure of an action proposes actions for at most this many objects."""
 _SAME_PICK = 0.010
 """Pixels within this distance of the pick, in metres, count as the same pick."""
 _OTHER_PICKS = 0.060
@@ -50,6 +56,26 @@ class Reliability:
         total = self.weights[""]
         total += sum(self.weights[name] * value for name, value in evidence.items())
         return 1 / (1 + math.exp(-max(-30.0, min(total, 30.0))))
+
+
+def surest(items: Iterable[Item], confidence: Callable[[Item], float], least: float) -> Item:
+    """Returns the first of several proposals whose confidence is at least `least`; if there is
+    none, the one with the highest confidence.
+
+    Only the first `MOST_PROPOSALS` are considered, and no proposal is made after the first sure
+    one.
+
+    Args:
+        items: the proposals, in the order in which the policy prefers them; not empty.
+        confidence: the confidence of a proposal, from 0 to 1.
+        least: the least confidence with which the robot acts.
+    """
+    seen: list[Item] = []
+    for item in islice(items, MOST_PROPOSALS):
+        seen.append(item)
+        if confidence(item) >= least:
+            break
+    return max(seen, key=confidence)
 
 
 def read_reliability(policy: str, weights: Path | None = None) -> Reliability:

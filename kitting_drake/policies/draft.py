@@ -18,7 +18,8 @@ from torch import Tensor
 from kitting_drake.policies.data.images import Image, rotation_matrix
 from kitting_drake.policies.matching.inventory import Inventory
 from kitting_drake.policies.matching.jaw_clearance import RETRY_DISTANCE, failed_pixels
-from kitting_drake.policies.matching.regions.segmentation import Segmentation
+from kitting_drake.policies.matching.refinement import closest_to, nearest_region
+from kitting_drake.policies.matching.regions.segmentation import Region, Segmentation
 from kitting_drake.policies.networks.factored import AnglePrediction, Networks, PlacePrediction
 from kitting_drake.policies.networks.layers.correlation import Candidate
 from systems.signals import (
@@ -109,7 +110,7 @@ class Look:
         logits = self.picking.position
         if not self.failed_picks:
             return logits
-        return _without(logits, near_failed(self.observation.grid, self.failed_picks))
+        return without(logits, near_failed(self.observation.grid, self.failed_picks))
 
 
 class Stage(Protocol):
@@ -182,10 +183,30 @@ class Draft:
     def among(self, mask: Mask) -> Draft | None:
         """Returns the best pick within a mask (rows, cols), refined by `stages`; None if the mask
         leaves no pixel to pick."""
-        left = _without(self.logits, ~mask)
-        if not bool((left > _NEVER).any()):
+        left = without(self.logits, ~mask)
+        return make_draft(self.look, left, self.stages) if is_any_left(left) else None
+
+    @property
+    def picked(self) -> Mask:
+        """(rows, cols) mask of the pixels near `pixel`, and, if `outlined`, of all whose nearest
+        object is the one at the pick."""
+        near, region = self.near(RETRY_DISTANCE), self.region
+        if region is None:
+            return near
+        return near | closest_to(region, self.look.segmentation.objects)
+
+    @property
+    def region(self) -> Region | None:
+        """The object at the pick; None if there is none, or if `outlined` is false."""
+        if not self.outlined:
             return None
-        return make_draft(self.look, left, self.stages)
+        return nearest_region(self.look.segmentation.objects, self.pick)
+
+    def near(self, distance: float) -> Mask:
+        """(rows, cols) mask of the pixels at most `distance` metres from `pixel`."""
+        rows, cols = np.indices(tuple(self.logits.shape))
+        away = np.hypot(rows - self.pixel[0], cols - self.pixel[1])
+        return np.asarray(away * self.look.resolution <= distance)
 
 
 def make_draft(look: Look, logits: Tensor, stages: Sequence[Stage]) -> Draft:
@@ -258,8 +279,13 @@ def best_placement(
     return wrap_to_pi(found[0] * math.tau / orientations), found[1:]
 
 
-def _without(logits: Tensor, mask: Mask) -> Tensor:
-    """Returns the logits with -inf at the pixels of the mask."""
+def is_any_left(logits: Tensor) -> bool:
+    """Whether the logits (rows, cols) allow any pixel."""
+    return bool((logits > _NEVER).any())
+
+
+def without(logits: Tensor, mask: Mask) -> Tensor:
+    """Returns the logits (rows, cols) with -inf at the pixels of the mask."""
     return logits.masked_fill(torch.from_numpy(mask).to(logits.device), _NEVER)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,9 +12,18 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
+from torch import Tensor
 
 from kitting_drake.policies.data.images import make_action, rotation_matrix
-from kitting_drake.policies.draft import Draft, Look, Stage, make_draft, network_input
+from kitting_drake.policies.draft import (
+    Draft,
+    Look,
+    Stage,
+    is_any_left,
+    make_draft,
+    network_input,
+    without,
+)
 from kitting_drake.policies.matching.evidence import Evidence, geometric_evidence
 from kitting_drake.policies.networks.factored import Networks
 from kitting_drake.policies.stages import StopRule, SubPixel
@@ -121,12 +130,37 @@ class LearnedPolicy:
 
         The arguments are those of `__call__`.
         """
-        draft = self._draft(observation, failed_picks)
+        return next(self.proposals(observation, failed_picks))
+
+    def proposals(
+        self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()
+    ) -> Iterator[tuple[PickPlaceAction, Decision | None]]:
+        """Yields the result of `act`, then those for the other objects.
+
+        The last one is a stop, an action of the stage `Recovery`, or that for the last object.
+        Without outlines there are no objects, and each pick is more than `RETRY_DISTANCE` from the
+        others.
+
+        The arguments are those of `__call__`.
+        """
+        look = self._look(observation, failed_picks)
+        logits = look.first_logits()
+        draft = self._draft(look, logits)
+        while True:
+            yield self._result(draft)
+            logits = without(logits, draft.picked)
+            if draft.stop or draft.mending is not None or not is_any_left(logits):
+                return
+            draft = self._draft(look, logits)
+            if draft.outlined and draft.region is None and not draft.stop:
+                return
+
+    def _result(self, draft: Draft) -> tuple[PickPlaceAction, Decision | None]:
         if draft.mending is not None:
             return draft.look.inventory.named(draft.mending), None
         decision = _decision(draft)
         if self._watch is not None:
-            self._watch(observation, decision)
+            self._watch(draft.look.observation, decision)
         if decision.stop:
             action = decision.action
             stop = PickPlaceAction(stop=True, reason=action.reason, left_over=action.left_over)
@@ -139,7 +173,8 @@ class LearnedPolicy:
 
         The arguments are those of `__call__`.
         """
-        return _decision(self._draft(observation, failed_picks))
+        look = self._look(observation, failed_picks)
+        return _decision(self._draft(look, look.first_logits()))
 
     @torch.inference_mode()
     def log_odds(self, observation: Observation) -> float | None:
@@ -149,9 +184,12 @@ class LearnedPolicy:
         return self._networks.predict_pick(image, self._orientations).log_odds
 
     @torch.inference_mode()
-    def _draft(self, observation: Observation, failed_picks: Sequence[PlanarPose]) -> Draft:
-        look = Look(self._networks, self._orientations, observation, failed_picks, self._resolution)
-        return make_draft(look, look.first_logits(), self._stages)
+    def _look(self, observation: Observation, failed_picks: Sequence[PlanarPose]) -> Look:
+        return Look(self._networks, self._orientations, observation, failed_picks, self._resolution)
+
+    @torch.inference_mode()
+    def _draft(self, look: Look, logits: Tensor) -> Draft:
+        return make_draft(look, logits, self._stages)
 
 
 @torch.inference_mode()

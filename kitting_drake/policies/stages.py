@@ -21,7 +21,6 @@ from kitting_drake.policies.matching.recovery import (
     recovery_action,
 )
 from kitting_drake.policies.matching.refinement import nearest_region, refine_grasp, refine_place
-from kitting_drake.policies.matching.regions.segmentation import Region
 from kitting_drake.policies.matching.regions.visibility import Visibility
 from kitting_drake.policies.matching.release_clearance import blocked_at_place
 from kitting_drake.policies.matching.shape_matching import best_insertion
@@ -76,7 +75,7 @@ def make_stages(
     if may_stop:
         stages.append(OutlineStop() if outlines else StopRule())
     if continuous:
-        stages.append(SeenOnly(planner, outlines))
+        stages.append(SeenOnly(planner))
     if recover:
         stages.append(Recovery(planner))
     return tuple(stages)
@@ -269,8 +268,6 @@ class SeenOnly:
     qualifies."""
 
     planner: PickPlaceParameters
-    outlines: bool = True
-    """Whether the segmentation of o_t into objects is used."""
 
     def refine(self, draft: Draft) -> Draft:
         visibility = Visibility.of(draft.look.observation)
@@ -281,10 +278,8 @@ class SeenOnly:
                 break
             if allowed[found.pixel] and self._is_seen(found, visibility):
                 return found
-            rows, cols = np.indices(allowed.shape)
-            away = np.hypot(rows - found.pixel[0], cols - found.pixel[1])
-            allowed = allowed & (away * found.look.resolution > _ANOTHER)
-            region = self._region(found)
+            allowed = allowed & ~found.near(_ANOTHER)
+            region = found.region
             if number % 2 and region is not None:
                 # A second pick of the same object did not help, so try another object.
                 allowed = allowed & ~region.mask
@@ -297,15 +292,9 @@ class SeenOnly:
         picks = draft.pick[None], np.array([draft.theta])
         if not visibility.picks_are_seen(*picks, self.planner.open_width).all():
             return False
-        region = self._region(draft)
+        region = draft.region
         footprint = None if region is None else region.pixels.astype(float)
         return visibility.place_is_seen(footprint, draft.pick, draft.rotation, draft.place)
-
-    def _region(self, draft: Draft) -> Region | None:
-        """Returns the object under the pick; None if the segmentation is not used."""
-        if not self.outlines:
-            return None
-        return nearest_region(draft.look.segmentation.objects, draft.pick)
 
 
 @dataclass(frozen=True)
@@ -335,10 +324,10 @@ class Recovery:
         arguments = look.inventory, self.planner, look.failed_picks
         if draft.stop:
             # The networks' grasp may lack room where another grasp of the object has room.
-            inserted, _ = best_insertion(*arguments)
+            inserted = best_insertion(*arguments)
             if inserted is not None:
-                first = mending is not None and look.inventory.needs_clearing(inserted.action)
-                return dataclasses.replace(draft, mending=mending if first else inserted.action)
+                first = mending is not None and look.inventory.needs_clearing(inserted)
+                return dataclasses.replace(draft, mending=mending if first else inserted)
             mending = preparing_action(*arguments, mending)
         elif look.inventory.is_heap(draft.pick):
             # The networks would place whatever lies on top.

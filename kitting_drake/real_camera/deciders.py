@@ -3,24 +3,30 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import chain, takewhile
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from kitting_drake.policies.confidence import (
     certainty,
     evidence_of_networks,
     read_reliability,
+    surest,
 )
 from kitting_drake.policies.factory import (
     LoadedPolicy,
     load_learned_policy,
     make_shape_matching,
 )
+from kitting_drake.policies.matching.shape_matching import Matched
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
+
+if TYPE_CHECKING:
+    from kitting_drake.policies.learned_policy import Decision
 
 Draw = Callable[[str], bytes]
 """A function that draws a decision as a PNG, with a given title."""
@@ -93,13 +99,16 @@ class ShapeMatchingDecider:
 
     def choose(self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()) -> Choice:
         policy = make_shape_matching(self.parameters, recover=self.recover)
-        matched = policy.decide(observation, failed_picks)
-        draw = partial(_draw_action, observation, matched.action)
-        if matched.geometry is None:
-            return Choice(matched.action, None, draw=draw)
         reliability = read_reliability("shape_matching")
         least = reliability.threshold if self.least_confidence is None else self.least_confidence
-        return _if_sure(reliability.confidence(matched.geometry), least, matched.action, {}, draw)
+
+        def choice(matched: Matched) -> Choice:
+            facts = matched.geometry
+            confidence = None if facts is None else reliability.confidence(facts)
+            draw = partial(_draw_action, observation, matched.action)
+            return Choice(matched.action, confidence, draw=draw)
+
+        return _surest(map(choice, policy.proposals(observation, failed_picks)), least)
 
 
 @dataclass(frozen=True)
@@ -107,7 +116,8 @@ class _Networks:
     """A learned policy; see `load_policy`."""
 
     loaded: LoadedPolicy
-    least_confidence: float | None
+    least: float
+    """The least confidence, from 0 to 1, with which the policy acts."""
 
     @property
     def name(self) -> str:
@@ -117,7 +127,12 @@ class _Networks:
         self.loaded.check_grid(grid, "workspace.resolution")
 
     def choose(self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()) -> Choice:
-        action, decision = self.loaded.function.act(observation, failed_picks)
+        proposals = self.loaded.function.proposals(observation, failed_picks)
+        return _surest((self._choice(observation, *item) for item in proposals), self.least)
+
+    def _choice(
+        self, observation: Observation, action: PickPlaceAction, decision: Decision | None
+    ) -> Choice:
         if decision is None:
             return Choice(action, None, draw=partial(_draw_action, observation, action))
         parts = certainty(decision, observation.grid.resolution)
@@ -135,30 +150,30 @@ class _Networks:
             return Choice(action, parts.get("nothing_to_pick"), parts, draw)
         if decision.kit_seen is None:
             # The fitted confidence holds only for decisions that use outlines. For other decisions
-            # use the networks' own certainty, and act at any certainty unless the caller sets a
-            # threshold.
-            return _if_sure(
-                math.prod(parts.values()), self.least_confidence or 0.0, action, parts, draw
-            )
+            # use the networks' own certainty.
+            return Choice(action, math.prod(parts.values()), parts, draw)
         evidence = evidence_of_networks(observation, decision)
-        reliability = read_reliability("networks", self.loaded.path)
-        least = reliability.threshold if self.least_confidence is None else self.least_confidence
-        return _if_sure(reliability.confidence(evidence), least, action, parts, draw)
+        confidence = read_reliability("networks", self.loaded.path).confidence(evidence)
+        return Choice(action, confidence, parts, draw)
 
 
-def _if_sure(
-    confidence: float,
-    least: float,
-    action: PickPlaceAction,
-    parts: dict[str, float],
-    draw: Draw,
-) -> Choice:
-    """Returns the action with its confidence, or a stop if the confidence is too low."""
-    if confidence >= least:
-        said = f"the probability of success is {confidence:.2f}"
-        return Choice(action, confidence, parts, draw, said)
-    said = f"the best action succeeds with probability {confidence:.2f}, less than {least:.2f}"
-    return Choice(PickPlaceAction(stop=True, reason="not sure"), confidence, parts, draw, said)
+def _surest(choices: Iterator[Choice], least: float) -> Choice:
+    """Returns the first choice if it is a stop or has no confidence; else the `surest` action, or a
+    stop if even its confidence is less than `least`."""
+
+    def is_estimated(choice: Choice) -> bool:
+        return choice.confidence is not None and not choice.action.stop
+
+    first = next(choices)
+    if not is_estimated(first):
+        return first
+    others = takewhile(is_estimated, choices)
+    best = surest(chain([first], others), lambda choice: choice.confidence or 0.0, least)
+    said = f"the probability of success is {best.confidence:.2f}"
+    if (best.confidence or 0.0) >= least:
+        return replace(best, reason=said)
+    said = f"the best action succeeds with probability {best.confidence:.2f}, less than {least:.2f}"
+    return replace(best, action=PickPlaceAction(stop=True, reason="not sure"), reason=said)
 
 
 def load_policy(
@@ -182,7 +197,7 @@ def load_policy(
         parameters: the parameters of the robot's motion; None for the simulated cell's defaults.
             Give `decide` the same.
         least_confidence: the least confidence, from 0 to 1, with which the policy acts; None for
-            the threshold of `confidence.json`, 0.9.
+            the threshold of `confidence.json`, 0.9, or for 0 without outlines.
 
     Raises:
         UserError: the file is unusable, or the networks do not support N orientations.
@@ -195,7 +210,12 @@ def load_policy(
         orientations_field="--orientations",
         recover=recover,
     )
-    return _Networks(loaded, least_confidence)
+    least = 0.0
+    if least_confidence is not None:
+        least = least_confidence
+    elif fit_outlines:
+        least = read_reliability("networks", loaded.path).threshold
+    return _Networks(loaded, least)
 
 
 def _draw_action(observation: Observation, action: PickPlaceAction, title: str) -> bytes:

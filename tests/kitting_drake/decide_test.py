@@ -7,7 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from kitting_drake.policies.factory import load_learned_policy
 from kitting_drake.policies.matching.inventory import Inventory
 from kitting_drake.policies.matching.recovery import recovery_action
 from kitting_drake.policies.matching.regions.segmentation import segment
+from kitting_drake.policies.matching.shape_matching import Matched, ShapeMatchingPolicy
 from kitting_drake.policies.stages import Recovery
 from kitting_drake.real_camera import Frame, ShapeMatching, decide, load_policy, read_frames
 from kitting_drake.real_camera.calibrations.calibration import (
@@ -33,6 +34,7 @@ from kitting_drake.scenario import load_scenario
 from kitting_drake.scenario.cameras import LookAt, camera_pose
 from kitting_drake.scenario.schema import Scenario
 from systems.pick_place_parameters import PickPlaceParameters
+from systems.signals import PickPlaceAction
 from tests.kitting_drake.real_camera.frames import (
     ROOT,
     Rendered,
@@ -557,6 +559,27 @@ def test_without_outlines_the_networks_certainty_counts(scene: Rendered):
         scene.observation
     )
     assert strict.action.stop and strict.action.reason == "not sure"
+
+
+def test_another_object_is_proposed_if_the_first_is_unsure(
+    scene: Rendered, monkeypatch: pytest.MonkeyPatch
+):
+    policy = ShapeMatchingPolicy(PickPlaceParameters())
+    first, second, *_ = policy.proposals(scene.observation)
+    assert first.geometry is not None
+    unsure = dataclasses.replace(first, geometry=first.geometry | {"fit": 2.0, "cost": 5.0})
+
+    def propose(*arguments) -> Iterator[Matched]:
+        yield from (unsure, second)
+
+    monkeypatch.setattr(ShapeMatchingPolicy, "proposals", propose)
+    chosen = ShapeMatching().choose(scene.observation)
+    assert chosen.action == second.action
+    assert chosen.confidence is not None and chosen.confidence > 0.9
+    # If neither is sure, the answer is a refusal with the greater confidence.
+    refused = ShapeMatching(least_confidence=1.0).choose(scene.observation)
+    assert refused.action == PickPlaceAction(stop=True, reason="not sure")
+    assert refused.confidence == chosen.confidence
 
 
 def test_networks_need_their_own_pixel_size(weights_file: Path):

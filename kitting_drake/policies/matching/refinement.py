@@ -193,6 +193,16 @@ def nearest_region(regions: tuple[Region, ...], pixel: Array) -> Region | None:
     return best
 
 
+def closest_to(region: Region, regions: tuple[Region, ...]) -> NDArray[np.bool_]:
+    """Returns a mask of the pixels for which `nearest_region` may be this one of the regions: the
+    region, its holes and what is near it, except the other regions."""
+    mask = ndimage.binary_fill_holes(ndimage.binary_dilation(region.mask, iterations=int(_NEAR)))
+    for other in regions:
+        if other is not region:
+            mask &= ~other.mask
+    return np.asarray(mask)
+
+
 def _encloses(region: Region, pixel: Array) -> bool:
     """Whether a position (row, col) lies in a hole of a region."""
     row, col = np.rint(pixel).astype(int)

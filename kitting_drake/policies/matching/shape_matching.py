@@ -3,7 +3,7 @@ have room."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from kitting_drake.policies.data.images import make_action
@@ -57,60 +57,87 @@ class ShapeMatchingPolicy:
 
     def decide(self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()) -> Matched:
         """Returns the action and facts about it. For the arguments see `__call__`."""
+        return next(self.proposals(observation, failed_picks))
+
+    def proposals(
+        self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()
+    ) -> Iterator[Matched]:
+        """Yields the result of `decide`, then the insertions of the other objects that fit, best
+        first.
+
+        The arguments are those of `__call__`.
+        """
         inventory = Inventory.of(observation)
-        mending = None
-        if self._recover:
-            mending = recovery_action(inventory, self._planner, failed_picks)
+        arguments = inventory, self._planner, failed_picks
+        mending = recovery_action(*arguments) if self._recover else None
         if mending is not None and mending.press:
-            return Matched(mending)
-        matched, reason = best_insertion(inventory, self._planner, failed_picks)
-        if matched is not None:
+            yield Matched(mending)
+            return
+        found, reason = False, ""
+        for matched in insertions(*arguments):
+            if matched.action.stop:
+                reason = matched.action.reason
+                continue
+            found = True
             if mending is not None and inventory.needs_clearing(matched.action):
-                return Matched(inventory.named(mending))
-            return matched
+                yield Matched(inventory.named(mending))
+            else:
+                yield matched
+        if found:
+            return
         if self._recover:
-            prepared = preparing_action(inventory, self._planner, failed_picks, mending)
+            prepared = preparing_action(*arguments, mending)
             if prepared is not None:
-                return Matched(inventory.named(prepared))
+                yield Matched(inventory.named(prepared))
+                return
         reason = reason or inventory.why_stop
-        return Matched(PickPlaceAction(stop=True, reason=reason, left_over=inventory.left_over))
+        yield Matched(PickPlaceAction(stop=True, reason=reason, left_over=inventory.left_over))
 
 
 def best_insertion(
     inventory: Inventory, planner: PickPlaceParameters, failed_picks: Sequence[PlanarPose] = ()
-) -> tuple[Matched | None, str]:
-    """Finds the best-fitting object for which the jaws have room.
+) -> PickPlaceAction | None:
+    """Returns the action that inserts the best-fitting object, of those for which the jaws have
+    room; None if no insertion is possible.
+
+    The arguments are those of `insertions`.
+    """
+    found = (item.action for item in insertions(inventory, planner, failed_picks))
+    return next((action for action in found if not action.stop), None)
+
+
+def insertions(
+    inventory: Inventory, planner: PickPlaceParameters, failed_picks: Sequence[PlanarPose] = ()
+) -> Iterator[Matched]:
+    """Yields the insertion of each object that fits into a recess, best fit first.
+
+    An insertion is a stop with a reason if the jaws lack room, or if too little is seen.
 
     Args:
         inventory: the objects and recesses of the observation.
         planner: parameters of the motion with which the hand will pick and place.
         failed_picks: gripper poses at which a grasp failed before; they are avoided.
-
-    Returns:
-        The action that inserts the object, and an empty string. If no insertion is possible, None
-            and the reason, a key of `STOP_REASONS`; it is empty if no object fits.
     """
     observation, segmentation = inventory.observation, inventory.segmentation
     failed = failed_pixels(observation.grid, failed_picks)
     resolution = observation.grid.resolution
-    reason = ""
     for pair in inventory.pairs:
-        reason, fit = "not seen", pair.fit
-        region = segmentation.objects[pair.item]
+        region, fit = segmentation.objects[pair.item], pair.fit
         grasps = jaw_grasps(
             segmentation, region, resolution, planner, balance=inventory.memory.balance(region)
         )
         grasps = untried(grasps, failed, resolution)
         if not grasps:
-            reason = "not sure"
+            yield Matched(PickPlaceAction(stop=True, reason="not sure"))
             continue
         best = grasps[0]
         place = fit.moved(best.pixel)
         footprint = region.pixels.astype(float)
-        if segmentation.visibility.place_is_seen(footprint, best.pixel, fit.rotation, place):
-            action = make_action(observation, best.pixel, best.theta, place, fit.rotation)
-            geometry = geometric_evidence(
-                segmentation, best.pixel, fit.rotation, place, fit.cost, best.cost
-            )
-            return Matched(inventory.named(action), geometry), ""
-    return None, reason
+        if not segmentation.visibility.place_is_seen(footprint, best.pixel, fit.rotation, place):
+            yield Matched(PickPlaceAction(stop=True, reason="not seen"))
+            continue
+        action = make_action(observation, best.pixel, best.theta, place, fit.rotation)
+        geometry = geometric_evidence(
+            segmentation, best.pixel, fit.rotation, place, fit.cost, best.cost
+        )
+        yield Matched(inventory.named(action), geometry)

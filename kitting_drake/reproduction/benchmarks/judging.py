@@ -71,23 +71,6 @@ def judge(
     return "right" if np.percentile(away, 95) <= PLACE_OFF else "place"
 
 
-def covering(
-    action: PickPlaceAction,
-    loose: Sequence[LooseTool],
-    planner: PickPlaceParameters,
-    observation: Observation,
-) -> list[PlanarPose]:
-    """Returns poses all over the tool that an action picks. The arguments are those of `judge`.
-
-    A policy that gets them as failed picks takes another tool next.
-    """
-    picked, _ = _picked(_jaws(action, planner, observation), loose, planner)
-    if picked is None:
-        return [action.pick]
-    points = _outline(picked.tool.footprint, picked.X_WT)[::6]
-    return [action.pick, *(PlanarPose(float(x), float(y)) for x, y in points)]
-
-
 @dataclass(frozen=True)
 class _Jaws:
     """The open jaws at a pick."""

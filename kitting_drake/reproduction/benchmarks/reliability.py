@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -21,18 +22,20 @@ from kitting_drake.common.files import write_atomically, write_json
 from kitting_drake.common.processes import counting_bar
 from kitting_drake.common.provenance import commit
 from kitting_drake.policies.confidence import (
+    MOST_PROPOSALS,
     Reliability,
     evidence_of_networks,
     read_reliability,
+    surest,
 )
 from kitting_drake.policies.factory import load_learned_policy, make_shape_matching
 from kitting_drake.policies.matching.evidence import Evidence
-from kitting_drake.reproduction.benchmarks.judging import covering, judge
+from kitting_drake.reproduction.benchmarks.judging import judge
 from kitting_drake.scenario import Scenario
 from kitting_drake.static_scenes.drawing import DrawnScene, draw_scenes
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.sensor_noise import SensorNoiseParameters
-from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
+from systems.signals import Observation, PickPlaceAction, PixelGrid
 
 Array = NDArray[np.float64]
 
@@ -50,9 +53,6 @@ _EVERY = 4
 of each seed gives more different tools."""
 _WITHOUT_KIT = 0.1
 """The share of scenes without a kit."""
-_DECISIONS = 3
-"""The largest number of decisions of a policy in a scene. Each avoids the tools of the earlier
-decisions."""
 LEAST_CONFIDENCE = 0.9
 """The confidence below which a robot does not act. This threshold is not fitted: confidence is a
 probability of success, so the threshold follows from the cost of a wrong action."""
@@ -66,13 +66,14 @@ _SHRINKAGE = 1e-3
 
 @dataclass(frozen=True)
 class Judged:
-    """A decision of a policy, with the verdict on it."""
+    """A proposal of a policy, with the verdict on it. A policy makes up to `MOST_PROPOSALS` in a
+    scene."""
 
     policy: str
     """The policy: `networks` or `shape_matching`."""
     scene: int
     verdict: str
-    """The result of `judge`; `stop` if the policy did not act."""
+    """The result of `judge`; `stop` if the policy stops."""
     evidence: Evidence
     cameras: int
     """The number of random cameras; zero for the default cameras."""
@@ -168,7 +169,7 @@ def _cross_validated(judged: list[Judged]) -> list[float]:
 
 
 def draw_judged(first_seed: int, count: int, weights: Path | None = None) -> Iterator[Judged]:
-    """Yields the judged decisions of all `POLICIES` on scenes that are drawn at random.
+    """Yields the judged proposals of all `POLICIES` on scenes that are drawn at random.
 
     Args:
         first_seed: the seed of the first scene.
@@ -179,30 +180,29 @@ def draw_judged(first_seed: int, count: int, weights: Path | None = None) -> Ite
     networks = load_learned_policy(weights, planner, insertion=True).function
     matching = make_shape_matching(planner)
 
-    def by_networks(seen: Observation, tried: list[PlanarPose]) -> tuple[PickPlaceAction, Evidence]:
-        action, decision = networks.act(seen, tried)
-        if decision is None or action.stop:
-            return action, {}
-        return action, evidence_of_networks(seen, decision)
+    def by_networks(seen: Observation) -> Iterator[tuple[PickPlaceAction, Evidence]]:
+        for action, decision in networks.proposals(seen):
+            if decision is not None and decision.kit_seen is False:
+                yield PickPlaceAction(stop=True, reason="no kit seen"), {}
+                return
+            if decision is None or action.stop:
+                yield action, {}
+            else:
+                yield action, evidence_of_networks(seen, decision)
 
-    def by_matching(seen: Observation, tried: list[PlanarPose]) -> tuple[PickPlaceAction, Evidence]:
-        matched = matching.decide(seen, tried)
-        return matched.action, matched.geometry or {}
+    def by_matching(seen: Observation) -> Iterator[tuple[PickPlaceAction, Evidence]]:
+        for matched in matching.proposals(seen):
+            yield matched.action, matched.geometry or {}
 
     for number, scene in zip(range(count), _scenes(first_seed), strict=False):
         observation = scene.render(PixelGrid())
-        for policy, decide in (("networks", by_networks), ("shape_matching", by_matching)):
-            tried: list[PlanarPose] = []
-            for _ in range(_DECISIONS):
-                action, evidence = decide(observation, tried)
+        cameras = len(scene.cameras) if scene.cameras != Scenario().cameras else 0
+        for policy, propose in (("networks", by_networks), ("shape_matching", by_matching)):
+            for action, evidence in islice(propose(observation), MOST_PROPOSALS):
                 verdict = (
                     "stop" if action.stop else judge(action, scene.loose, planner, observation)
                 )
-                cameras = len(scene.cameras) if scene.cameras != Scenario().cameras else 0
                 yield Judged(policy, number, verdict, evidence, cameras, action.reason)
-                if action.stop:
-                    break
-                tried += covering(action, scene.loose, planner, observation)
 
 
 def _scenes(first_seed: int) -> Iterator[DrawnScene]:
@@ -292,16 +292,17 @@ class ReliabilitySummary:
 def summarize(
     judged: list[Judged], confidences: list[float], threshold: float
 ) -> ReliabilitySummary:
-    """Summarizes the decisions of one policy.
+    """Summarizes the decisions of one policy. Of the proposals in a scene, only the `surest` one
+    counts.
 
     Args:
-        judged: the decisions.
-        confidences: the confidence of each decision, from 0 to 1.
+        judged: the proposals.
+        confidences: the confidence of each proposal, from 0 to 1.
         threshold: the least confidence with which to act.
     """
-    acted = [k for k, item in enumerate(judged) if item.verdict != "stop"]
-    right = np.array([judged[k].verdict == "right" for k in acted])
-    confidence = np.array([confidences[k] for k in acted])
+    chosen = _chosen(judged, confidences, threshold)
+    right = np.array([judged[k].verdict == "right" for k in chosen])
+    confidence = np.array([confidences[k] for k in chosen])
     bins = []
     for low in np.arange(_BINS) / _BINS:
         inside = (confidence >= low) & (confidence < low + 1 / _BINS + (low > 0.89))
@@ -309,16 +310,28 @@ def summarize(
             bins.append(
                 (float(confidence[inside].mean()), float(right[inside].mean()), int(inside.sum()))
             )
-    error = sum(abs(mean - share) * count for mean, share, count in bins) / len(acted)
+    error = sum(abs(mean - share) * count for mean, share, count in bins) / len(chosen)
     answered = confidence >= threshold
     return ReliabilitySummary(
-        decisions=len(acted),
+        decisions=len(chosen),
         right=float(right.mean()),
         calibration_error=float(error),
         wrong_answers=float((~right[answered]).mean()) if answered.any() else 0.0,
         refused=float((~answered[right]).mean()) if right.any() else 0.0,
         bins=bins,
     )
+
+
+def _chosen(judged: list[Judged], confidences: list[float], threshold: float) -> list[int]:
+    """Returns the index of the proposal that is chosen in each scene, as on a real bench.
+
+    Scenes in which the policy stops at once have none.
+    """
+    by_scene: dict[int, list[int]] = {}
+    for k, item in enumerate(judged):
+        if item.verdict != "stop":
+            by_scene.setdefault(item.scene, []).append(k)
+    return [surest(found, confidences.__getitem__, threshold) for found in by_scene.values()]
 
 
 def as_lines(judged: Iterable[Judged]) -> Iterator[str]:

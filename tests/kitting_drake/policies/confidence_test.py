@@ -1,11 +1,12 @@
 """The confidence of decisions: how it is fitted, and the evidence from which it is computed."""
 
 import dataclasses
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
 
-from kitting_drake.policies.confidence import read_reliability
+from kitting_drake.policies.confidence import read_reliability, surest
 from kitting_drake.policies.matching.shape_matching import ShapeMatchingPolicy
 from kitting_drake.reproduction.benchmarks.reliability import (
     LEAST_CONFIDENCE,
@@ -41,6 +42,41 @@ def test_the_fit_finds_the_law_and_is_calibrated():
     assert sum(count for *_, count in summary.bins) == summary.decisions == 2000
     # The calibration error reveals a confidence that is always high.
     assert summarize(others, [0.98] * len(others), 0.9).calibration_error > 0.2
+
+
+@pytest.mark.parametrize(
+    ("confidences", "asked", "chosen"),
+    [
+        ([0.95, 0.99], 1, 0.95),
+        ([0.4, 0.92, 0.99], 2, 0.92),
+        ([0.4, 0.8, 0.6, 0.99], 3, 0.8),
+        ([0.3], 1, 0.3),
+    ],
+)
+def test_the_first_sure_proposal_is_chosen(confidences: list[float], asked: int, chosen: float):
+    """If none is sure, the surest is. A proposal takes time, so no more are made than needed."""
+    made = []
+
+    def propose() -> Iterator[float]:
+        for confidence in confidences:
+            made.append(confidence)
+            yield confidence
+
+    assert surest(propose(), lambda confidence: confidence, 0.9) == chosen
+    assert len(made) == asked
+
+
+def test_the_proposal_that_is_chosen_counts():
+    proposals = [
+        Judged("networks", 0, "place", {}, 0),
+        Judged("networks", 0, "right", {}, 0),
+        Judged("networks", 1, "right", {}, 0),
+        Judged("networks", 1, "stop", {}, 0, "done"),
+        Judged("networks", 2, "stop", {}, 0, "done"),
+    ]
+    summary = summarize(proposals, [0.5, 0.95, 0.8, 0.0, 0.0], 0.9)
+    assert (summary.decisions, summary.right) == (2, 1.0)
+    assert (summary.wrong_answers, summary.refused) == (0.0, 0.5)
 
 
 @pytest.mark.parametrize("policy", ["networks", "shape_matching"])

@@ -83,6 +83,29 @@ def test_places_a_tool_into_its_recess(seen):
     assert angle < math.radians(2)
 
 
+def test_the_proposals_place_one_tool_each(seen):
+    """Both policies propose the action that they would take, then actions for the other tools."""
+    observation, scene = seen
+    matching = [item.action for item in ShapeMatchingPolicy(PLANNER).proposals(observation)]
+    assert matching[0] == ShapeMatchingPolicy(PLANNER)(observation)
+    # Few orientations are faster.
+    learned = LearnedPolicy(load_networks(GENERALIST), orientations=36, stages=FITTING)
+    proposed = [action for action, _ in learned.proposals(observation)]
+    assert proposed[0] == learned(observation)
+    for actions in (matching, proposed):
+        placing = [action for action in actions if not action.stop]
+        tools = {nearest_tool(action, scene) for action in placing}
+        assert len(placing) == len(tools) == 4
+        for action in placing:
+            distance, angle = errors_of(action, scene)
+            assert distance < 0.003 and angle < math.radians(3)
+
+
+def nearest_tool(action, scene) -> int:
+    lies = [o[0][:2] for o in true_places(scene)]
+    return int(np.argmin([math.dist(xy, (action.pick.x, action.pick.y)) for xy in lies]))
+
+
 def test_avoids_failed_grasps(seen):
     observation, _ = seen
     tried = []
