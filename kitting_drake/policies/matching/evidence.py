@@ -25,10 +25,14 @@ _HOLE = 0.003
 """Pixels that are lower than the rim by more than this, in metres, count as a hole."""
 _REGION_FACTS = (
     *("is_object", "object_seen", "depth", "hole", "size", "apart"),
-    *("over_recess", "cost", "reverse", "spread", "rival", "offset", "too_high", "recess_seen"),
+    *("over_recess", "cost", "reverse", "spread", "rival", "offset"),
+    *("too_high", "height_off", "recess_seen"),
 )
-"""All of these facts are zero if no object is under the pick. Those of the second row are also zero
-if no recess is under the place."""
+"""All of these facts are zero if no object is under the pick. Those of the last two rows are also
+zero if no recess is under the place."""
+_USUAL_TOO_HIGH = -0.0007
+"""A cavity is as deep as its tool is high. The measured heights of tool and recess differ by this
+in the median of the right decisions, in metres."""
 _FAR = 20.0
 """Upper limit of the distance from other objects, in mm."""
 _WORST_FIT = 0.002
@@ -122,6 +126,7 @@ def _fit_facts(
         outline_of(recess, resolution),
         Registration(rotation, place - rotation_matrix(rotation) @ pick, 0.0),
     )
+    too_high = region.height - recess.height
     return {
         "over_recess": 1.0,
         "cost": 1e3 * min(quality.cost, 0.005),
@@ -129,7 +134,8 @@ def _fit_facts(
         "spread": 1e3 * resolution * min(quality.spread, 1.0),
         "rival": 1e3 * float(np.clip(quality.rival, -0.003, 0.006)),
         "offset": 1e3 * quality.offset,
-        "too_high": 1e3 * float(np.clip(region.height - recess.height, -0.03, 0.03)),
+        "too_high": 1e3 * float(np.clip(too_high, -0.03, 0.03)),
+        "height_off": 1e3 * min(abs(too_high - _USUAL_TOO_HIGH), 0.008),
         "recess_seen": float(segmentation.visibility.seen[recess.mask].mean()),
     }
 

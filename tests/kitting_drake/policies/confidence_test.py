@@ -31,7 +31,7 @@ def drawn(seed: int, count: int = 2000) -> list[Judged]:
 
 
 def test_the_fit_finds_the_law_and_is_calibrated():
-    found = fit(drawn(0))
+    found = fit(drawn(0, 20_000))
     assert found.weights["a"] == pytest.approx(3, rel=0.15)
     assert found.weights["b"] == pytest.approx(-2, rel=0.15)
     others = drawn(1)
