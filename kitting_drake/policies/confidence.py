@@ -52,9 +52,12 @@ class Reliability:
     """The least confidence at which the robot acts."""
 
     def confidence(self, evidence: Evidence) -> float:
-        """Returns the estimated probability of success, from 0 to 1."""
+        """Returns the estimated probability of success, from 0 to 1.
+
+        A fact that is newer than the regression has no weight.
+        """
         total = self.weights[""]
-        total += sum(self.weights[name] * value for name, value in evidence.items())
+        total += sum(self.weights.get(name, 0.0) * value for name, value in evidence.items())
         return 1 / (1 + math.exp(-max(-30.0, min(total, 30.0))))
 
 

@@ -18,7 +18,7 @@ from torch import Tensor
 from kitting_drake.policies.data.images import Image, rotation_matrix
 from kitting_drake.policies.matching.inventory import Inventory
 from kitting_drake.policies.matching.jaw_clearance import RETRY_DISTANCE, failed_pixels
-from kitting_drake.policies.matching.refinement import closest_to, nearest_region
+from kitting_drake.policies.matching.refinement import nearest_region
 from kitting_drake.policies.matching.regions.segmentation import Region, Segmentation
 from kitting_drake.policies.networks.factored import AnglePrediction, Networks, PlacePrediction
 from kitting_drake.policies.networks.layers.correlation import Candidate
@@ -185,15 +185,6 @@ class Draft:
         leaves no pixel to pick."""
         left = without(self.logits, ~mask)
         return make_draft(self.look, left, self.stages) if is_any_left(left) else None
-
-    @property
-    def picked(self) -> Mask:
-        """(rows, cols) mask of the pixels near `pixel`, and, if `outlined`, of all whose nearest
-        object is the one at the pick."""
-        near, region = self.near(RETRY_DISTANCE), self.region
-        if region is None:
-            return near
-        return near | closest_to(region, self.look.segmentation.objects)
 
     @property
     def region(self) -> Region | None:

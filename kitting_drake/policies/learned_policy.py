@@ -25,6 +25,8 @@ from kitting_drake.policies.draft import (
     without,
 )
 from kitting_drake.policies.matching.evidence import Evidence, geometric_evidence
+from kitting_drake.policies.matching.refinement import belonging_to, nearest_region
+from kitting_drake.policies.matching.regions.segmentation import Region
 from kitting_drake.policies.networks.factored import Networks
 from kitting_drake.policies.stages import StopRule, SubPixel
 from systems.signals import LeftOver, Observation, PickPlaceAction, PlanarPose
@@ -135,25 +137,34 @@ class LearnedPolicy:
     def proposals(
         self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()
     ) -> Iterator[tuple[PickPlaceAction, Decision | None]]:
-        """Yields the result of `act`, then those for the other objects.
+        """Yields the result of `act`, then, if that is a pick and place, those for the other
+        objects.
 
-        The last one is a stop, an action of the stage `Recovery`, or that for the last object.
-        Without outlines there are no objects, and each pick is more than `RETRY_DISTANCE` from the
-        others.
+        Without outlines the objects are not known, so only the first result is yielded.
 
         The arguments are those of `__call__`.
         """
         look = self._look(observation, failed_picks)
-        logits = look.first_logits()
-        draft = self._draft(look, logits)
-        while True:
-            yield self._result(draft)
-            logits = without(logits, draft.picked)
-            if draft.stop or draft.mending is not None or not is_any_left(logits):
+        first = self._draft(look, look.first_logits())
+        yield self._result(first)
+        if first.stop or first.mending is not None or not first.outlined:
+            return
+        objects, tried = look.segmentation.objects, [first.region]
+        while others := tuple(item for item in objects if not _is_among(item, tried)):
+            known = [item for item in objects if _is_among(item, tried)]
+            near_others = belonging_to(others, known, observation.grid.shape)
+            logits = without(look.first_logits(), ~near_others)
+            if not is_any_left(logits):
                 return
             draft = self._draft(look, logits)
-            if draft.outlined and draft.region is None and not draft.stop:
+            proposed = nearest_region(others, np.array(draft.pixel, float))
+            if draft.stop or proposed is None:
                 return
+            # The stages may have moved the pick to an object that was tried.
+            is_new = draft.region is not None and not _is_among(draft.region, tried)
+            if is_new and draft.mending is None:
+                yield self._result(draft)
+            tried += [proposed, draft.region]
 
     def _result(self, draft: Draft) -> tuple[PickPlaceAction, Decision | None]:
         if draft.mending is not None:
@@ -190,6 +201,10 @@ class LearnedPolicy:
     @torch.inference_mode()
     def _draft(self, look: Look, logits: Tensor) -> Draft:
         return make_draft(look, logits, self._stages)
+
+
+def _is_among(region: Region, regions: Sequence[Region | None]) -> bool:
+    return any(region is item for item in regions)
 
 
 @torch.inference_mode()

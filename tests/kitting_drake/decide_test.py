@@ -7,7 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +34,8 @@ from kitting_drake.scenario import load_scenario
 from kitting_drake.scenario.cameras import LookAt, camera_pose
 from kitting_drake.scenario.schema import Scenario
 from systems.pick_place_parameters import PickPlaceParameters
-from systems.signals import PickPlaceAction
+from systems.signals import PickPlaceAction, PlanarPose
+from tests.kitting_drake.policies.matching.regions.visibility_test import kit_and_bar
 from tests.kitting_drake.real_camera.frames import (
     ROOT,
     Rendered,
@@ -559,27 +560,48 @@ def test_without_outlines_the_networks_certainty_counts(scene: Rendered):
         scene.observation
     )
     assert strict.action.stop and strict.action.reason == "not sure"
+    # Other objects are not known, so no other pick is proposed.
+    assert strict.confidence == found.confidence
 
 
+UNSURE, SURE, STOP, PRESS = "unsure", "sure", "stop", "press"
+
+
+@pytest.mark.parametrize(
+    ("proposed", "answer"),
+    [
+        ([SURE, UNSURE], 0),
+        ([UNSURE, SURE], 1),
+        ([UNSURE, UNSURE, SURE], 2),
+        ([UNSURE, UNSURE, UNSURE, SURE], None),
+        ([UNSURE, STOP], None),
+        ([UNSURE, PRESS], None),
+        ([STOP], 0),
+        ([PRESS, SURE], 0),
+    ],
+)
 def test_another_object_is_proposed_if_the_first_is_unsure(
-    scene: Rendered, monkeypatch: pytest.MonkeyPatch
+    proposed: list[str], answer: int | None, monkeypatch: pytest.MonkeyPatch
 ):
-    policy = ShapeMatchingPolicy(PickPlaceParameters())
-    first, second, *_ = policy.proposals(scene.observation)
-    assert first.geometry is not None
-    unsure = dataclasses.replace(first, geometry=first.geometry | {"fit": 2.0, "cost": 5.0})
-
-    def propose(*arguments) -> Iterator[Matched]:
-        yield from (unsure, second)
-
-    monkeypatch.setattr(ShapeMatchingPolicy, "proposals", propose)
-    chosen = ShapeMatching().choose(scene.observation)
-    assert chosen.action == second.action
-    assert chosen.confidence is not None and chosen.confidence > 0.9
-    # If neither is sure, the answer is a refusal with the greater confidence.
-    refused = ShapeMatching(least_confidence=1.0).choose(scene.observation)
-    assert refused.action == PickPlaceAction(stop=True, reason="not sure")
-    assert refused.confidence == chosen.confidence
+    """If none is sure, the answer is a refusal with the highest confidence. A stop, or an action
+    without a confidence, is an answer only if it comes first."""
+    (good,) = ShapeMatchingPolicy(PickPlaceParameters()).proposals(kit_and_bar(None))
+    assert good.geometry is not None
+    poor = good.geometry | {"fit": 2.0, "cost": 5.0, "reverse": 5.0}
+    made = []
+    for number, kind in enumerate(proposed):
+        action = dataclasses.replace(
+            good.action, pick=PlanarPose(0.01 * number), stop=kind == STOP, press=kind == PRESS
+        )
+        facts = {UNSURE: poor, SURE: good.geometry}.get(kind)
+        made.append(Matched(action, facts))
+    monkeypatch.setattr(ShapeMatchingPolicy, "proposals", lambda *arguments: iter(made))
+    chosen = ShapeMatching().choose(kit_and_bar(None))
+    if answer is None:
+        assert chosen.action == PickPlaceAction(stop=True, reason="not sure")
+        assert chosen.confidence is not None and chosen.confidence < 0.9
+    else:
+        assert chosen.action == made[answer].action
 
 
 def test_networks_need_their_own_pixel_size(weights_file: Path):

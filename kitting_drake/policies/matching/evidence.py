@@ -31,8 +31,8 @@ _REGION_FACTS = (
 """All of these facts are zero if no object is under the pick. Those of the last two rows are also
 zero if no recess is under the place."""
 _USUAL_TOO_HIGH = -0.0007
-"""A cavity is as deep as its tool is high. The measured heights of tool and recess differ by this
-in the median of the right decisions, in metres."""
+"""A cavity is as deep as its tool is high, if tools do not stand out of the kit. The measured
+heights of tool and recess then differ by this, in metres: the median of the right decisions."""
 _FAR = 20.0
 """Upper limit of the distance from other objects, in mm."""
 _WORST_FIT = 0.002

@@ -193,13 +193,17 @@ def nearest_region(regions: tuple[Region, ...], pixel: Array) -> Region | None:
     return best
 
 
-def closest_to(region: Region, regions: tuple[Region, ...]) -> NDArray[np.bool_]:
-    """Returns a mask of the pixels for which `nearest_region` may be this one of the regions: the
-    region, its holes and what is near it, except the other regions."""
-    mask = ndimage.binary_fill_holes(ndimage.binary_dilation(region.mask, iterations=int(_NEAR)))
-    for other in regions:
-        if other is not region:
-            mask &= ~other.mask
+def belonging_to(
+    regions: Sequence[Region], others: Sequence[Region], shape: tuple[int, int]
+) -> NDArray[np.bool_]:
+    """Returns a mask (rows, cols) of the pixels for which `nearest_region` finds one of some
+    regions. The pixels of other regions are left out."""
+    inside = np.zeros(shape, bool)
+    for region in regions:
+        inside |= ndimage.binary_fill_holes(region.mask)
+    mask = inside if not regions else ndimage.distance_transform_edt(~inside) < _NEAR
+    for region in others:
+        mask &= ~region.mask
     return np.asarray(mask)
 
 

@@ -62,8 +62,10 @@ class ShapeMatchingPolicy:
     def proposals(
         self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()
     ) -> Iterator[Matched]:
-        """Yields the result of `decide`, then the insertions of the other objects that fit, best
-        first.
+        """Yields the result of `decide`, then, if that is a pick and place, the insertions of the
+        other objects that fit, best first.
+
+        Insertions for which another object must first be moved away are left out there.
 
         The arguments are those of `__call__`.
         """
@@ -78,11 +80,12 @@ class ShapeMatchingPolicy:
             if matched.action.stop:
                 reason = matched.action.reason
                 continue
-            found = True
-            if mending is not None and inventory.needs_clearing(matched.action):
-                yield Matched(inventory.named(mending))
-            else:
+            if mending is None or not inventory.needs_clearing(matched.action):
                 yield matched
+            elif not found:
+                yield Matched(inventory.named(mending))
+                return
+            found = True
         if found:
             return
         if self._recover:

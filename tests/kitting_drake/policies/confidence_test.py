@@ -1,12 +1,14 @@
 """The confidence of decisions: how it is fitted, and the evidence from which it is computed."""
 
 import dataclasses
+import json
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from kitting_drake.policies.confidence import read_reliability, surest
+from kitting_drake.policies.confidence import FILE, read_reliability, surest
 from kitting_drake.policies.matching.shape_matching import ShapeMatchingPolicy
 from kitting_drake.reproduction.benchmarks.reliability import (
     LEAST_CONFIDENCE,
@@ -84,6 +86,17 @@ def test_the_shipped_regressions(policy: str):
     found = read_reliability(policy)
     assert found.threshold == LEAST_CONFIDENCE
     assert found.weights["fit"] < 0
+
+
+def test_a_regression_may_be_older_than_a_fact(tmp_path: Path):
+    record = json.loads(FILE.read_text())
+    del record["networks"]["weights"]["height_off"]
+    (tmp_path / "own.confidence.json").write_text(json.dumps(record))
+    old = read_reliability("networks", tmp_path / "own.safetensors")
+    facts = dict.fromkeys(read_reliability("networks").weights.keys() - {""}, 0.5)
+    assert old.confidence(facts) == old.confidence(facts | {"height_off": 8.0})
+    new = read_reliability("networks")
+    assert new.confidence(facts) > new.confidence(facts | {"height_off": 8.0})
 
 
 def test_a_poor_fit_is_less_likely_to_succeed():

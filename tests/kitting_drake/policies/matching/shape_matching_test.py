@@ -21,6 +21,7 @@ from kitting_drake.policies.stages import make_stages
 from kitting_drake.scenario.loader import load_scenario
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import Observation, PlanarPose, fill_unseen
+from tests.kitting_drake.policies.matching.regions.visibility_test import kit_and_bar
 from tests.kitting_drake.rig import build_rig
 
 pytestmark = pytest.mark.skipif(not can_render(), reason="images cannot be rendered here")
@@ -99,6 +100,26 @@ def test_the_proposals_place_one_tool_each(seen):
         for action in placing:
             distance, angle = errors_of(action, scene)
             assert distance < 0.003 and angle < math.radians(3)
+
+
+@pytest.mark.parametrize("degrees", [0, 45])
+def test_no_object_is_proposed_twice(degrees: float):
+    """Pixels near an object belong to it, also beside its corners."""
+    seen = kit_and_bar(None)
+    image = seen.image.copy()
+    image[3, :, 200:] = 0
+    rows, cols = np.indices(seen.grid.shape)
+    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    along, across = (cols - 244) * c + (rows - 81) * s, (rows - 81) * c - (cols - 244) * s
+    image[3, (abs(along) < 25) & (abs(across) < 3.5)] = 0.015
+    seen = dataclasses.replace(seen, image=image)
+    # Few orientations are faster.
+    policy = LearnedPolicy(load_networks(GENERALIST), orientations=36, stages=FITTING)
+    ((action, decision),) = policy.proposals(seen)
+    assert not action.stop and decision is not None
+    # After a failed grasp the object is proposed once more, elsewhere.
+    ((again, _),) = policy.proposals(seen, [action.pick])
+    assert math.dist((again.pick.x, again.pick.y), (action.pick.x, action.pick.y)) > 0.0099
 
 
 def nearest_tool(action, scene) -> int:
