@@ -28,7 +28,7 @@ from systems.signals import Observation
 if TYPE_CHECKING:
     from kitting_drake.policies.learned_policy import Decision
 
-Item = TypeVar("Item")
+_Item = TypeVar("_Item")
 
 FILE = MODELS / "policies" / "confidence.json"
 """The file of the fitted regressions, one for each kind of policy."""
@@ -61,7 +61,7 @@ class Reliability:
         return 1 / (1 + math.exp(-max(-30.0, min(total, 30.0))))
 
 
-def surest(items: Iterable[Item], confidence: Callable[[Item], float], least: float) -> Item:
+def surest(items: Iterable[_Item], confidence: Callable[[_Item], float], least: float) -> _Item:
     """Returns the first of several proposals whose confidence is at least `least`; if there is
     none, the one with the highest confidence.
 
@@ -73,7 +73,7 @@ def surest(items: Iterable[Item], confidence: Callable[[Item], float], least: fl
         confidence: the confidence of a proposal, from 0 to 1.
         least: the least confidence with which the robot acts.
     """
-    seen: list[Item] = []
+    seen: list[_Item] = []
     for item in islice(items, MOST_PROPOSALS):
         seen.append(item)
         if confidence(item) >= least:

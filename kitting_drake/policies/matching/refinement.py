@@ -196,12 +196,12 @@ def nearest_region(regions: tuple[Region, ...], pixel: Array) -> Region | None:
 def belonging_to(
     regions: Sequence[Region], others: Sequence[Region], shape: tuple[int, int]
 ) -> NDArray[np.bool_]:
-    """Returns a mask (rows, cols) of the pixels for which `nearest_region` finds one of some
-    regions. The pixels of other regions are left out."""
+    """Returns a mask (rows, cols) of the pixels for which `nearest_region` finds one of these
+    regions, of which there is at least one. The pixels of `others` are left out."""
     inside = np.zeros(shape, bool)
     for region in regions:
         inside |= ndimage.binary_fill_holes(region.mask)
-    mask = inside if not regions else ndimage.distance_transform_edt(~inside) < _NEAR
+    mask = ndimage.distance_transform_edt(~inside) < _NEAR
     for region in others:
         mask &= ~region.mask
     return np.asarray(mask)

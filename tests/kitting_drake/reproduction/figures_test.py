@@ -171,6 +171,12 @@ def test_the_sentences_of_the_readme(runs: dict[str, Summary], readme: str):
     assert f"reaches {plain:.1f} % here. The same weights reach {extended:.1f} % with our" in text
     red = [percent(runs, f"place_red_in_green_so2_{n}_1") for n in (36, 180)]
     assert f"place red in green ({red[0]} and {red[1]} %, at N = 36 and 180)" in text
+    pyramid, boxes = (
+        [f"{100 * float(runs[f'{task}_so2_{n}_1']['success_rate']):.1f}" for n in orientations]
+        for task, orientations in (("stack_block_pyramid", (36, 180)), ("palletizing_boxes", (36,)))
+    )
+    assert f"the pyramid ({pyramid[0]} and {pyramid[1]} %)" in text
+    assert f"palletizing ({boxes[0]} %, at N = 36)" in text
     rows_of = json.loads((RESULTS / "networks.json").read_text())["pick_angle"]
     seconds = {
         (row["method"], row["preset"], row["orientations"]): row["seconds"] for row in rows_of
