@@ -32,8 +32,9 @@ class BoundedBody:
 
 _NOWHERE = 1e6
 """Every element of a pose's matrix before the first update; far from every pose."""
-_KEPT_AWAKE = 1 / 16
-"""An object that something nearby keeps awake is tested again after this time, in s."""
+_RESTS_EVERY = 1 / 16
+"""Objects come to rest only at multiples of this time, in s. Objects that touch must come to rest
+together, because each would wake the other."""
 _ROTATION_AND_POSITION = np.tile([[1, 0], [1, 0], [1, 0], [0, 1]], (3, 1)).astype(float)
 """(12, 2): sums the elements of the rotation, and those of the position, of a pose's (3, 4)
 matrix."""
@@ -107,9 +108,9 @@ class RestDetector(LeafSystem):
       are those of the oriented boxes around the collision geometry, which are lower bounds.
 
     An object at rest wakes when a mover, or an object that is not at rest, comes within
-    `wake_distance`. It then stays awake for at least 1/16 s. An object that has left the cell (its
-    distance from the world's origin is `GONE` or more) is at rest at once, because a body that
-    spins forever would overflow its quaternion.
+    `wake_distance`. Objects come to rest only at multiples of 1/16 s. An object that has left the
+    cell (its distance from the world's origin is `GONE` or more) is at rest at once, because a body
+    that spins forever would overflow its quaternion.
 
     State (discrete): for each object the pose that it stays near, the time that it has stayed
     there (s), and whether it rests; the poses when distances were last tested, and how far bodies
@@ -162,6 +163,7 @@ class RestDetector(LeafSystem):
         self._time_to_sleep = time_to_sleep
         self._wake_distance = wake_distance
         self._period = period
+        self._rests_every = max(1, round(_RESTS_EVERY / period))
         self._poses = self.DeclareAbstractInputPort("body_poses", Value([RigidTransform()]))
         # The poses that the objects must stay near, then the poses of all bodies at the last test.
         self._references = self.DeclareDiscreteState(
@@ -192,16 +194,16 @@ class RestDetector(LeafSystem):
             references[:n][~stayed] = now[:n][~stayed]
             still_for[~stayed] = 0.0
         resting = stayed & (still_for >= self._time_to_sleep - self._period / 2)
+        if round(context.get_time() / self._period) % self._rests_every:
+            # Nothing comes to rest now.
+            resting &= at_rest > 0.5
         if resting.any():
             margin = discrete_state.get_mutable_value(self._margin)
             moved = 2 * (np.sqrt(squares[n:]) * self._reaches).sum(axis=1).max()
             # The first condition is also true for NaN.
             if not moved <= margin[0] or (resting != at_rest).any():
-                candidates = resting.copy()
                 margin[0] = self._wake(now.reshape(-1, 3, 4), resting)
                 references[n:] = now
-                woken = candidates & ~resting
-                still_for[woken] = np.minimum(still_for[woken], self._time_to_sleep - _KEPT_AWAKE)
         at_rest[:] = resting
         # This form is also true for NaN.
         if not np.abs(now[:n]).max(initial=0.0) < GONE / 2:
