@@ -21,7 +21,7 @@ from kitting_drake.real_camera.calibrations.calibration import (
     read_calibration,
     write_calibration,
 )
-from kitting_drake.real_camera.deciders import BenchPolicy, load_policy
+from kitting_drake.real_camera.deciders import BenchPolicy, Choice, load_policy
 from kitting_drake.real_camera.deciders import ShapeMatchingDecider as ShapeMatching
 from kitting_drake.real_camera.decision import BenchDecision, decide
 from kitting_drake.real_camera.frames import Frame, read_frames
@@ -34,6 +34,7 @@ __all__ = [
     "BenchPolicy",
     "BenchRobot",
     "Calibration",
+    "Choice",
     "Frame",
     "ShapeMatching",
     "decide",

@@ -1,4 +1,4 @@
-"""The policies for real cameras. Each returns an action, a confidence and a picture."""
+"""The policies for real cameras. Each yields actions, with a confidence and a picture."""
 
 from __future__ import annotations
 
@@ -6,11 +6,12 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import chain, takewhile
+from itertools import chain, islice, takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 from kitting_drake.policies.confidence import (
+    MOST_PROPOSALS,
     certainty,
     evidence_of_networks,
     read_reliability,
@@ -73,8 +74,16 @@ class BenchPolicy(Protocol):
         """
         ...
 
-    def choose(self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()) -> Choice:
-        """Chooses an action for an observation; avoids the failed picks."""
+    def choices(
+        self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()
+    ) -> Iterator[Choice]:
+        """Yields the choice for an observation. If it is an action, the choices for other objects
+        may follow, for a robot that cannot reach the first.
+
+        Args:
+            observation: the heightmap o_t.
+            failed_picks: gripper poses at which a grasp failed before; they are avoided.
+        """
         ...
 
 
@@ -97,7 +106,9 @@ class ShapeMatchingDecider:
     def check_grid(self, grid: PixelGrid) -> None:
         """Does nothing: shape matching supports every grid."""
 
-    def choose(self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()) -> Choice:
+    def choices(
+        self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()
+    ) -> Iterator[Choice]:
         policy = make_shape_matching(self.parameters, recover=self.recover)
         reliability = read_reliability("shape_matching")
         least = reliability.threshold if self.least_confidence is None else self.least_confidence
@@ -108,7 +119,7 @@ class ShapeMatchingDecider:
             draw = partial(_draw_action, observation, matched.action)
             return Choice(matched.action, confidence, draw=draw)
 
-        return _surest(map(choice, policy.proposals(observation, failed_picks)), least)
+        return _sure_choices(map(choice, policy.proposals(observation, failed_picks)), least)
 
 
 @dataclass(frozen=True)
@@ -126,9 +137,11 @@ class _Networks:
     def check_grid(self, grid: PixelGrid) -> None:
         self.loaded.check_grid(grid, "workspace.resolution")
 
-    def choose(self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()) -> Choice:
+    def choices(
+        self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()
+    ) -> Iterator[Choice]:
         proposals = self.loaded.function.proposals(observation, failed_picks)
-        return _surest((self._choice(observation, *item) for item in proposals), self.least)
+        return _sure_choices((self._choice(observation, *item) for item in proposals), self.least)
 
     def _choice(
         self, observation: Observation, action: PickPlaceAction, decision: Decision | None
@@ -157,23 +170,33 @@ class _Networks:
         return Choice(action, confidence, parts, draw)
 
 
-def _surest(choices: Iterator[Choice], least: float) -> Choice:
-    """Returns the first choice if it is a stop or has no confidence; else the `surest` action, or a
-    stop if even its confidence is less than `least`."""
+def _sure_choices(choices: Iterator[Choice], least: float) -> Iterator[Choice]:
+    """Yields the first choice if it is a stop or has no confidence; else the actions whose
+    confidence is at least `least`, or a stop if there are none."""
 
     def is_estimated(choice: Choice) -> bool:
         return choice.confidence is not None and not choice.action.stop
 
+    def confidence(choice: Choice) -> float:
+        return choice.confidence or 0.0
+
     first = next(choices)
     if not is_estimated(first):
-        return first
-    others = takewhile(is_estimated, choices)
-    best = surest(chain([first], others), lambda choice: choice.confidence or 0.0, least)
-    said = f"the probability of success is {best.confidence:.2f}"
-    if (best.confidence or 0.0) >= least:
-        return replace(best, reason=said)
-    said = f"the best action succeeds with probability {best.confidence:.2f}, less than {least:.2f}"
-    return replace(best, action=PickPlaceAction(stop=True, reason="not sure"), reason=said)
+        yield first
+        return
+    proposals = islice(chain([first], takewhile(is_estimated, choices)), MOST_PROPOSALS)
+    best = surest(proposals, confidence, least)
+    if confidence(best) < least:
+        said = (
+            f"the best action succeeds with probability {best.confidence:.2f}, "
+            f"less than {least:.2f}"
+        )
+        yield replace(best, action=PickPlaceAction(stop=True, reason="not sure"), reason=said)
+        return
+    for choice in chain([best], proposals):
+        if confidence(choice) >= least:
+            said = f"the probability of success is {choice.confidence:.2f}"
+            yield replace(choice, reason=said)
 
 
 def load_policy(

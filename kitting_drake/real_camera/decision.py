@@ -139,7 +139,7 @@ def decide(
 
     The decision is to act only if the cameras see the table where it should be, pick and place are
     visible enough, and the action is likely to succeed. With a robot, the action must also be in
-    reach.
+    reach: if the first one is not, actions for other objects are tried.
 
     Args:
         frames: each camera's frame by its name.
@@ -165,35 +165,49 @@ def decide(
         warnings = check_table(checked, calibration)
     except CalibrationError as error:
         return _stopped("calibration", str(error), observation, seen, parameters)
-    choice = policy.choose(observation, failed_picks)
-    action = choice.action
-    if action.stop and action.reason != "not seen" and seen < _SEEN_TO_STOP:
+    out_of_reach: tuple[Choice, str] | None = None
+    for choice in policy.choices(observation, failed_picks):
+        action = choice.action
+        if action.stop:
+            return _refused(choice, observation, seen, parameters, warnings)
+        surfaces = read_surface_heights(observation, action.pick, action.place)
+        trajectory = None if robot is None else robot.plan(action, surfaces, parameters)
+        if not isinstance(trajectory, str):
+            return BenchDecision(
+                "press" if action.press else "pick and place",
+                choice.reason,
+                observation,
+                seen,
+                choice,
+                surfaces,
+                motion_heights(surfaces, parameters),
+                parameters,
+                warnings,
+                trajectory,
+            )
+        out_of_reach = out_of_reach or (choice, trajectory)
+    assert out_of_reach is not None  # A policy makes at least one choice.
+    choice, said = out_of_reach
+    choice = replace(choice, action=PickPlaceAction(stop=True, reason="not sure"))
+    return _stopped("not sure", said, observation, seen, parameters, choice, warnings)
+
+
+def _refused(
+    choice: Choice,
+    observation: Observation,
+    seen: float,
+    parameters: PickPlaceParameters,
+    warnings: Sequence[str],
+) -> BenchDecision:
+    """Returns the decision for a choice to stop."""
+    result = choice.action.reason or "done"
+    said = choice.reason or STOP_REASONS.get(choice.action.reason, "nothing is left to do")
+    if result != "not seen" and seen < _SEEN_TO_STOP:
+        result = "not seen"
         said = (
             f"only {100 * seen:.0f} % of the pixels in view are measured: an object may be hidden"
         )
-        return _stopped("not seen", said, observation, seen, parameters, choice, warnings)
-    if action.stop:
-        said = choice.reason or STOP_REASONS.get(action.reason, "nothing is left to do")
-        result = action.reason or "done"
-        return _stopped(result, said, observation, seen, parameters, choice, warnings)
-    surfaces = read_surface_heights(observation, action.pick, action.place)
-    trajectory = None if robot is None else robot.plan(action, surfaces, parameters)
-    if isinstance(trajectory, str):
-        refused = replace(choice, action=PickPlaceAction(stop=True, reason="not sure"))
-        return _stopped("not sure", trajectory, observation, seen, parameters, refused, warnings)
-    result = "press" if action.press else "pick and place"
-    return BenchDecision(
-        result,
-        choice.reason,
-        observation,
-        seen,
-        choice,
-        surfaces,
-        motion_heights(surfaces, parameters),
-        parameters,
-        warnings,
-        trajectory,
-    )
+    return _stopped(result, said, observation, seen, parameters, choice, warnings)
 
 
 def _stopped(

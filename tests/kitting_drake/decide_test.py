@@ -7,7 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,15 @@ from kitting_drake.policies.matching.recovery import recovery_action
 from kitting_drake.policies.matching.regions.segmentation import segment
 from kitting_drake.policies.matching.shape_matching import Matched, ShapeMatchingPolicy
 from kitting_drake.policies.stages import Recovery
-from kitting_drake.real_camera import Frame, ShapeMatching, decide, load_policy, read_frames
+from kitting_drake.real_camera import (
+    BenchRobot,
+    Choice,
+    Frame,
+    ShapeMatching,
+    decide,
+    load_policy,
+    read_frames,
+)
 from kitting_drake.real_camera.calibrations.calibration import (
     Calibration,
     read_calibration,
@@ -34,7 +42,7 @@ from kitting_drake.scenario import load_scenario
 from kitting_drake.scenario.cameras import LookAt, camera_pose
 from kitting_drake.scenario.schema import Scenario
 from systems.pick_place_parameters import PickPlaceParameters
-from systems.signals import PickPlaceAction, PlanarPose
+from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
 from tests.kitting_drake.policies.matching.regions.visibility_test import kit_and_bar
 from tests.kitting_drake.real_camera.frames import (
     ROOT,
@@ -553,10 +561,10 @@ def test_without_outlines_the_networks_certainty_counts(scene: Rendered):
 
     Without `least_confidence`, no decision is refused.
     """
-    found = load_policy(fit_outlines=False, orientations=36).choose(scene.observation)
+    (found,) = load_policy(fit_outlines=False, orientations=36).choices(scene.observation)
     assert not found.action.stop
     assert found.confidence == pytest.approx(np.prod(list(found.parts.values())))
-    strict = load_policy(fit_outlines=False, orientations=36, least_confidence=0.999).choose(
+    (strict,) = load_policy(fit_outlines=False, orientations=36, least_confidence=0.999).choices(
         scene.observation
     )
     assert strict.action.stop and strict.action.reason == "not sure"
@@ -568,20 +576,23 @@ UNSURE, SURE, STOP, PRESS = "unsure", "sure", "stop", "press"
 
 
 @pytest.mark.parametrize(
-    ("proposed", "answer"),
+    ("proposed", "answers"),
     [
-        ([SURE, UNSURE], 0),
-        ([UNSURE, SURE], 1),
-        ([UNSURE, UNSURE, SURE], 2),
-        ([UNSURE, UNSURE, UNSURE, SURE], None),
-        ([UNSURE, STOP], None),
-        ([UNSURE, PRESS], None),
-        ([STOP], 0),
-        ([PRESS, SURE], 0),
+        ([SURE, UNSURE], [0]),
+        ([UNSURE, SURE], [1]),
+        ([UNSURE, UNSURE, SURE], [2]),
+        ([SURE, UNSURE, SURE], [0, 2]),
+        ([SURE, UNSURE, UNSURE, SURE], [0]),
+        ([SURE, PRESS], [0]),
+        ([UNSURE, UNSURE, UNSURE, SURE], []),
+        ([UNSURE, STOP], []),
+        ([UNSURE, PRESS], []),
+        ([STOP], [0]),
+        ([PRESS, SURE], [0]),
     ],
 )
 def test_another_object_is_proposed_if_the_first_is_unsure(
-    proposed: list[str], answer: int | None, monkeypatch: pytest.MonkeyPatch
+    proposed: list[str], answers: list[int], monkeypatch: pytest.MonkeyPatch
 ):
     """If none is sure, the answer is a refusal with the highest confidence. A stop, or an action
     without a confidence, is an answer only if it comes first."""
@@ -596,12 +607,42 @@ def test_another_object_is_proposed_if_the_first_is_unsure(
         facts = {UNSURE: poor, SURE: good.geometry}.get(kind)
         made.append(Matched(action, facts))
     monkeypatch.setattr(ShapeMatchingPolicy, "proposals", lambda *arguments: iter(made))
-    chosen = ShapeMatching().choose(kit_and_bar(None))
-    if answer is None:
-        assert chosen.action == PickPlaceAction(stop=True, reason="not sure")
-        assert chosen.confidence is not None and chosen.confidence < 0.9
+    chosen = list(ShapeMatching().choices(kit_and_bar(None)))
+    if not answers:
+        (refusal,) = chosen
+        assert refusal.action == PickPlaceAction(stop=True, reason="not sure")
+        assert refusal.confidence is not None and refusal.confidence < 0.9
     else:
-        assert chosen.action == made[answer].action
+        assert [item.action for item in chosen] == [made[number].action for number in answers]
+
+
+@dataclasses.dataclass(frozen=True)
+class Offers:
+    """A policy that is sure of several picks, with the same place."""
+
+    picks: tuple[PlanarPose, ...]
+    name = "offers"
+
+    def check_grid(self, grid: PixelGrid) -> None:
+        pass
+
+    def choices(
+        self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()
+    ) -> Iterator[Choice]:
+        for pick in self.picks:
+            yield Choice(PickPlaceAction(pick, PlanarPose(0.5, 0.1)), 0.95)
+
+
+def test_the_robot_acts_on_the_first_object_that_it_reaches(scene: Rendered):
+    far, near = PlanarPose(0.5, 2.0), PlanarPose(0.5, -0.1)
+    arguments = cast(TRUE), TRUE
+    decision = decide(*arguments, Offers((far, near, PlanarPose(0.4))), robot=BenchRobot())
+    assert decision.result == "pick and place" and decision.action.pick == near
+    assert decision.trajectory is not None
+    decision = decide(*arguments, Offers((far, far)), robot=BenchRobot())
+    assert decision.result == "not sure" and "reach" in decision.reason
+    assert decision.action.stop and decision.trajectory is None
+    assert decide(*arguments, Offers((far, near))).action.pick == far
 
 
 def test_networks_need_their_own_pixel_size(weights_file: Path):
