@@ -12,9 +12,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from kitting_drake.policies.data.images import make_action
+from kitting_drake.policies.data.images import make_action, rotation_matrix
 from kitting_drake.policies.draft import Draft, Stage, expected_position
 from kitting_drake.policies.matching.inventory import mask_of
+from kitting_drake.policies.matching.jaw_clearance import jaw_grasps, untried
+from kitting_drake.policies.matching.placed_object import (
+    MOST_OUTSIDE,
+    at_pixel,
+    held_outside,
+    placed_mask,
+    recess_under,
+)
 from kitting_drake.policies.matching.recovery import (
     clearing_action,
     preparing_action,
@@ -69,7 +77,7 @@ def make_stages(
     if continuous:
         stages.append(SubPixel())
     if outlines:
-        stages += [JawRoom(planner), OutlinePlace(), BelongingFirst()]
+        stages += [JawRoom(planner), OutlinePlace(), HeldInside(planner), BelongingFirst()]
     elif continuous and fit_outlines:
         stages.append(ReleaseRoom(planner))
     if may_stop:
@@ -161,6 +169,41 @@ class OutlinePlace:
             fit_cost=pair.fit.cost,
             belongs=True,
         )
+
+
+@dataclass(frozen=True)
+class HeldInside:
+    """Chooses another grasp of an object that fits into a recess, if much of what the jaws hold
+    would lie outside the recess (`held_outside`)."""
+
+    planner: PickPlaceParameters
+
+    def refine(self, draft: Draft) -> Draft:
+        look, region = draft.look, draft.region
+        if draft.fitted is None or region is None:
+            return draft
+        motion = draft.pick, draft.rotation, draft.fitted
+        recess = recess_under(look.segmentation, placed_mask(region, *motion))
+        if recess is None:
+            return draft
+        outside = held_outside(region, recess, *motion, look.resolution)
+        if at_pixel(outside, draft.pick) <= MOST_OUTSIDE:
+            return draft
+        balance = look.inventory.memory.balance(region)
+        grasps = jaw_grasps(
+            look.segmentation, region, look.resolution, self.planner, balance=balance
+        )
+        for grasp in untried(grasps, look.failed_pixels, look.resolution):
+            if at_pixel(outside, grasp.pixel) <= MOST_OUTSIDE:
+                moved = rotation_matrix(draft.rotation) @ (grasp.pixel - draft.pick)
+                return dataclasses.replace(
+                    draft,
+                    pick=grasp.pixel,
+                    theta=grasp.theta,
+                    grasp_cost=grasp.cost,
+                    fitted=draft.fitted + moved,
+                )
+        return dataclasses.replace(draft, grasp_cost=None)
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from kitting_drake.policies.data.images import moved_pixels, rotation_matrix
+from kitting_drake.policies.data.images import rotation_matrix
+from kitting_drake.policies.matching.fit_quality import fit_quality
+from kitting_drake.policies.matching.placed_object import (
+    at_pixel,
+    held_outside,
+    placed_mask,
+    recess_under,
+)
 from kitting_drake.policies.matching.refinement import nearest_region
 from kitting_drake.policies.matching.regions.segmentation import Region, Segmentation
-from kitting_drake.policies.matching.registration import Registration, fit_quality, outline_of
+from kitting_drake.policies.matching.registration import Registration, outline_of
 
 Array = NDArray[np.float64]
 
@@ -25,8 +32,8 @@ _HOLE = 0.003
 """Pixels that are lower than the rim by more than this, in metres, count as a hole."""
 _REGION_FACTS = (
     *("is_object", "object_seen", "depth", "hole", "size", "apart"),
-    *("over_recess", "cost", "reverse", "spread", "rival", "offset"),
-    *("too_high", "height_off", "recess_seen"),
+    *("over_recess", "cost", "reverse", "agreement", "reverse_agreement", "spread", "rival"),
+    *("asymmetry", "offset", "too_high", "height_off", "held_outside", "recess_seen"),
 )
 """All of these facts are zero if no object is under the pick. Those of the last two rows are also
 zero if no recess is under the place."""
@@ -35,6 +42,8 @@ _USUAL_TOO_HIGH = -0.0007
 heights of tool and recess then differ by this, in metres: the median of the right decisions."""
 _FAR = 20.0
 """Upper limit of the distance from other objects, in mm."""
+_MOST_OUTSIDE = 0.5
+"""Upper limit of `held_outside`. More does not make an action less likely to succeed."""
 _WORST_FIT = 0.002
 _WORST_GRASP = 5.0
 
@@ -73,12 +82,7 @@ def geometric_evidence(
     region = nearest_region(segmentation.objects, pick)
     if region is None:
         return evidence
-    rows, cols = seen.shape
-    there = moved_pixels(region.pixels, pick, rotation, place)
-    inside = ((there >= 0) & (there < (rows, cols))).all(axis=1)
-    target = np.zeros_like(seen)
-    target[tuple(there[inside].T)] = True
-    target = ndimage.binary_closing(target, iterations=2) | target
+    target = placed_mask(region, pick, rotation, place)
     around = _ring(target)
     rim = float(np.percentile(relief[around], 75)) if around.any() else 0.0
     low = relief[target] < rim - _HOLE if target.any() else np.zeros(1, bool)
@@ -116,10 +120,9 @@ def _fit_facts(
 ) -> Evidence:
     """Returns facts about the fit of a placed object to the recess under it; empty if no recess is
     there."""
-    overlaps = [int((item.mask & target).sum()) for item in segmentation.recesses]
-    if not overlaps or not max(overlaps):
+    recess = recess_under(segmentation, target)
+    if recess is None:
         return {}
-    recess = segmentation.recesses[int(np.argmax(overlaps))]
     resolution = segmentation.visibility.resolution
     quality = fit_quality(
         outline_of(region, resolution, close=True),
@@ -127,15 +130,20 @@ def _fit_facts(
         Registration(rotation, place - rotation_matrix(rotation) @ pick, 0.0),
     )
     too_high = region.height - recess.height
+    outside = held_outside(region, recess, pick, rotation, place, resolution)
     return {
         "over_recess": 1.0,
         "cost": 1e3 * min(quality.cost, 0.005),
         "reverse": 1e3 * min(quality.reverse, 0.008),
+        "agreement": quality.agreement,
+        "reverse_agreement": quality.reverse_agreement,
         "spread": 1e3 * resolution * min(quality.spread, 1.0),
         "rival": 1e3 * float(np.clip(quality.rival, -0.003, 0.006)),
+        "asymmetry": 1e3 * min(quality.asymmetry, 0.006),
         "offset": 1e3 * quality.offset,
         "too_high": 1e3 * float(np.clip(too_high, -0.03, 0.03)),
         "height_off": 1e3 * min(abs(too_high - _USUAL_TOO_HIGH), 0.008),
+        "held_outside": min(at_pixel(outside, pick), _MOST_OUTSIDE),
         "recess_seen": float(segmentation.visibility.seen[recess.mask].mean()),
     }
 

@@ -34,7 +34,7 @@ _BAND = 0.006
 """The cost is computed at points within this distance, in metres, of the object's outline."""
 _FARTHEST = 0.012
 """Signed distances are clipped to plus or minus this many metres."""
-_ROBUST = 0.002
+ROBUST = 0.002
 """In the cost, residuals are capped at this many metres. Larger ones come from hidden or touching
 parts."""
 _WORST_REVERSE = 0.0025
@@ -48,10 +48,6 @@ this many metres. A larger offset could hide a wrong pose."""
 _HEIGHT_WEIGHT = 0.1
 """The weight, in a mismatch, of the difference between the object's height and the recess's
 depth."""
-_SAME_ROTATION = math.radians(8)
-"""Rotations closer than this angle count as the same."""
-_OTHER_ROTATION = math.radians(25)
-"""Rotations farther apart than this angle are clearly different."""
 _POINTS, _COARSE_POINTS = 700, 160
 _ROTATIONS = 72
 _STARTS = 3
@@ -77,7 +73,7 @@ class Outline:
 
     @cached_property
     def compared(self) -> list[tuple[Outline, tuple[Array, Array]]]:
-        """The outlines with which this one was compared, and the results (see `_coarse`)."""
+        """The outlines with which this one was compared, and the results (see `coarse_costs`)."""
         return []
 
     def sample(self, field: NDArray[np.float32], positions: Array, outside: float) -> Array:
@@ -190,13 +186,13 @@ def register(
 def coarse_cost(outline: Outline, recess: Outline) -> float:
     """Returns a quick estimate of the cost of the best fit that `register` would find, in
     metres."""
-    return float(_coarse(outline, recess)[0].min())
+    return float(coarse_costs(outline, recess)[0].min())
 
 
 def half_turn_ratio(outline: Outline, recess: Outline, rotation: float) -> float:
     """Returns the `coarse_cost` of the rotation that differs by half a turn, as a multiple of that
     of a rotation (in radians)."""
-    costs, angles = _coarse(outline, recess)
+    costs, angles = coarse_costs(outline, recess)
     here, turned = (
         costs[np.cos(angles - angle).argmax()] for angle in (rotation, rotation + math.pi)
     )
@@ -229,11 +225,11 @@ def _compare_outlines(outline: Outline, recess: Outline, fit: Registration) -> t
         (p,): the first array minus the signed distances of the points from the object's own
             outline.
     """
-    there, offset = _recess_distances(outline, recess, fit)
+    there, offset = recess_distances(outline, recess, fit)
     return there - offset, there - offset - outline.values
 
 
-def _recess_distances(outline: Outline, recess: Outline, fit: Registration) -> tuple[Array, float]:
+def recess_distances(outline: Outline, recess: Outline, fit: Registration) -> tuple[Array, float]:
     """Moves an object's points by a fit. Returns their signed distances (p,) from the recess's
     outline, and the offset between the outlines, both in metres."""
     positions = outline.points @ rotation_matrix(fit.rotation).T + fit.shift
@@ -249,59 +245,6 @@ def residuals(outline: Outline, recess: Outline, fit: Registration) -> Array:
     return recess.sample(recess.distance, positions, _FARTHEST) - outline.values - fit.offset
 
 
-@dataclass(frozen=True)
-class FitQuality:
-    """How well an object's outline, moved to a place, fits the recess there."""
-
-    cost: float
-    """The mean distance of the object's points from the recess's outline, in metres."""
-    reverse: float
-    """The mean distance of the recess's points from the object's outline, in metres."""
-    spread: float
-    """The standard deviation, in pixels, of the fitted positions of the object's points. It is
-    computed as if the errors of the distances were independent."""
-    rival: float
-    """The coarse cost of the best clearly different rotation, minus the coarse cost of this
-    rotation, in metres. It is small for objects with rotational symmetry."""
-    offset: float
-    """How much smaller the recess is than the object on every side, in metres; negative if the
-    recess is larger."""
-
-
-def fit_quality(outline: Outline, recess: Outline, fit: Registration) -> FitQuality:
-    """Measures how well an object fits a recess at the place to which a registration moves it.
-
-    Args:
-        outline: the outline of the object, with closed notches.
-        recess: the outline of the recess.
-        fit: the rotation and shift of the object. Its other fields are not used.
-    """
-    there, offset = _recess_distances(outline, recess, fit)
-    away = there - offset - outline.values
-    costs, angles = _coarse(outline, recess)
-    apart = np.abs((angles - fit.rotation + math.pi) % math.tau - math.pi)
-    here, others = costs[apart < _SAME_ROTATION], costs[apart > _OTHER_ROTATION]
-    return FitQuality(
-        cost=float(np.abs(away).mean()),
-        reverse=_reverse(outline, recess, fit),
-        spread=_spread(outline, recess, fit, away),
-        rival=float(others.min() - here.min()),
-        offset=offset,
-    )
-
-
-def _spread(outline: Outline, recess: Outline, fit: Registration, away: Array) -> float:
-    """Computes `FitQuality.spread` by linear error propagation from the distances `away` (p,)."""
-    turned = (outline.points - outline.middle) @ rotation_matrix(fit.rotation).T
-    jacobian = _jacobian(recess, turned, fit.moved(outline.middle) + turned)
-    weighted = jacobian / np.maximum(1, np.abs(away) / _ROBUST)[:, None]
-    normal = weighted.T @ jacobian
-    normal += np.diag(1e-4 * np.diag(normal) + 1e-12)
-    variances = np.diag(np.linalg.inv(normal)) * np.minimum(away**2, _ROBUST**2).mean()
-    arms = np.square(turned).sum(axis=1).mean()
-    return float(np.sqrt(variances[0] * arms + variances[1] + variances[2]))
-
-
 def is_covered(
     outline: Outline, recess: Outline, fit: Registration, within: float = _WORST_REVERSE
 ) -> bool:
@@ -312,15 +255,16 @@ def is_covered(
     distances of the recess's points from the object's outline show that such fits are poor. "Near"
     means that their mean is less than `within`, in metres.
     """
-    return _reverse(outline, recess, fit) < within
+    return bool(reverse_distances(outline, recess, fit).mean() < within)
 
 
-def _reverse(outline: Outline, recess: Outline, fit: Registration) -> float:
-    """The mean distance of the recess's points from the object's outline, in metres."""
+def reverse_distances(outline: Outline, recess: Outline, fit: Registration) -> Array:
+    """The differences (p,) of the outlines' signed distances at the recess's points, without their
+    sign, in metres."""
     back = (recess.points - fit.shift) @ rotation_matrix(fit.rotation)
-    _, offset = _recess_distances(outline, recess, fit)
+    _, offset = recess_distances(outline, recess, fit)
     reverse = outline.sample(outline.distance, back, _FARTHEST) - recess.values + offset
-    return float(np.abs(reverse).mean())
+    return np.abs(reverse)
 
 
 def mismatch(fit: Registration, item: Region, recess: Region) -> float:
@@ -328,7 +272,7 @@ def mismatch(fit: Registration, item: Region, recess: Region) -> float:
     return fit.cost + _HEIGHT_WEIGHT * abs(item.height - recess.height)
 
 
-def _coarse(outline: Outline, recess: Outline) -> tuple[Array, Array]:
+def coarse_costs(outline: Outline, recess: Outline) -> tuple[Array, Array]:
     """Returns the costs of evenly spaced rotations about the centroids, in metres, and these
     rotations in radians. They are computed once for each pair of outlines."""
     for other, found in outline.compared:
@@ -356,7 +300,7 @@ def _compare_coarsely(outline: Outline, recess: Outline) -> tuple[Array, Array]:
 
 
 def _coarse_starts(outline: Outline, recess: Outline) -> list[tuple[float, Array]]:
-    costs, angles = _coarse(outline, recess)
+    costs, angles = coarse_costs(outline, recess)
     lowest = (costs <= np.roll(costs, 1)) & (costs < np.roll(costs, -1))
     candidates = np.flatnonzero(lowest)
     if not len(candidates):
@@ -388,7 +332,7 @@ def _refine(
         if not np.isfinite(cost):
             offset = float(np.clip(np.median(residual), -largest, largest))
         residual = residual - offset
-        weight = 1 / np.maximum(1, np.abs(residual) / _ROBUST)
+        weight = 1 / np.maximum(1, np.abs(residual) / ROBUST)
         if within:
             weight **= 2
         now = float((weight * np.abs(residual)).mean())
@@ -397,7 +341,7 @@ def _refine(
             cost, best = now, (rotation, place, offset)
             if improved < 1e-6:
                 break
-        jacobian = _jacobian(recess, turned, positions)
+        jacobian = residual_slopes(recess, turned, positions)
         weighted = jacobian * weight[:, None]
         normal = weighted.T @ jacobian
         normal += np.diag(1e-4 * np.diag(normal) + 1e-12)
@@ -410,7 +354,7 @@ def _refine(
     return Registration(rotation, shift, cost, offset)
 
 
-def _jacobian(recess: Outline, turned: Array, positions: Array) -> Array:
+def residual_slopes(recess: Outline, turned: Array, positions: Array) -> Array:
     """(p, 4): the derivatives of the residuals with respect to rotation, row, col and offset.
 
     Args:

@@ -6,10 +6,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from kitting_drake.policies.data.images import make_action
 from kitting_drake.policies.matching.evidence import Evidence, geometric_evidence
 from kitting_drake.policies.matching.inventory import Inventory
 from kitting_drake.policies.matching.jaw_clearance import failed_pixels, jaw_grasps, untried
+from kitting_drake.policies.matching.placed_object import MOST_OUTSIDE, at_pixel, held_outside
 from kitting_drake.policies.matching.recovery import preparing_action, recovery_action
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import Observation, PickPlaceAction, PlanarPose
@@ -129,7 +132,13 @@ def insertions(
         grasps = jaw_grasps(
             segmentation, region, resolution, planner, balance=inventory.memory.balance(region)
         )
-        grasps = untried(grasps, failed, resolution)
+        recess = segmentation.recesses[pair.recess]
+        outside = held_outside(region, recess, np.zeros(2), fit.rotation, fit.shift, resolution)
+        grasps = [
+            grasp
+            for grasp in untried(grasps, failed, resolution)
+            if at_pixel(outside, grasp.pixel) <= MOST_OUTSIDE
+        ]
         if not grasps:
             yield Matched(PickPlaceAction(stop=True, reason="not sure"))
             continue
