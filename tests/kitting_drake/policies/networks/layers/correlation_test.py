@@ -76,7 +76,8 @@ def test_cross_correlation_computes_equation_8():
 def test_correlation_by_fft_equals_direct_correlation(sides: tuple[int, int], size: int):
     scene, kernels = torch.randn(1, 3, *sides), torch.randn(4, 3, size, size)
     plain, fast = cross_correlation(scene, kernels), cross_correlation_fft(scene, kernels)
-    torch.testing.assert_close(fast, plain, atol=1e-5 * float(plain.std()), rtol=0)
+    # Sums of 12,675 products are rounded differently by different processors.
+    torch.testing.assert_close(fast, plain, atol=1e-4 * float(plain.std()), rtol=0)
 
 
 @pytest.mark.parametrize(("sides", "size"), [((21, 33), 5), ((7, 30), 9)])
