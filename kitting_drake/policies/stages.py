@@ -16,19 +16,19 @@ from kitting_drake.policies.data.images import make_action, rotation_matrix
 from kitting_drake.policies.draft import Draft, Stage, expected_position
 from kitting_drake.policies.matching.inventory import mask_of
 from kitting_drake.policies.matching.jaw_clearance import jaw_grasps, untried
-from kitting_drake.policies.matching.placed_object import (
-    MOST_OUTSIDE,
-    at_pixel,
-    held_outside,
-    placed_mask,
-    recess_under,
-)
 from kitting_drake.policies.matching.recovery import (
     clearing_action,
     preparing_action,
     recovery_action,
 )
 from kitting_drake.policies.matching.refinement import nearest_region, refine_grasp, refine_place
+from kitting_drake.policies.matching.regions.placed_object import (
+    MOST_OUTSIDE,
+    at_pixel,
+    held_outside,
+    placed_mask,
+    recess_under,
+)
 from kitting_drake.policies.matching.regions.visibility import Visibility
 from kitting_drake.policies.matching.release_clearance import blocked_at_place
 from kitting_drake.policies.matching.shape_matching import best_insertion

@@ -11,13 +11,13 @@ from scipy import ndimage
 
 from kitting_drake.policies.data.images import rotation_matrix
 from kitting_drake.policies.matching.fit_quality import fit_quality
-from kitting_drake.policies.matching.placed_object import (
+from kitting_drake.policies.matching.refinement import nearest_region
+from kitting_drake.policies.matching.regions.placed_object import (
     at_pixel,
     held_outside,
     placed_mask,
     recess_under,
 )
-from kitting_drake.policies.matching.refinement import nearest_region
 from kitting_drake.policies.matching.regions.segmentation import Region, Segmentation
 from kitting_drake.policies.matching.registration import Registration, outline_of
 

@@ -12,8 +12,12 @@ from kitting_drake.policies.data.images import make_action
 from kitting_drake.policies.matching.evidence import Evidence, geometric_evidence
 from kitting_drake.policies.matching.inventory import Inventory
 from kitting_drake.policies.matching.jaw_clearance import failed_pixels, jaw_grasps, untried
-from kitting_drake.policies.matching.placed_object import MOST_OUTSIDE, at_pixel, held_outside
 from kitting_drake.policies.matching.recovery import preparing_action, recovery_action
+from kitting_drake.policies.matching.regions.placed_object import (
+    MOST_OUTSIDE,
+    at_pixel,
+    held_outside,
+)
 from systems.pick_place_parameters import PickPlaceParameters
 from systems.signals import Observation, PickPlaceAction, PlanarPose
 
