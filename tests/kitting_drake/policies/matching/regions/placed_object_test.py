@@ -5,7 +5,7 @@ import pytest
 
 from kitting_drake.policies.data.images import rotation_matrix
 from kitting_drake.policies.matching import shape_matching
-from kitting_drake.policies.matching.fit_quality import fit_quality
+from kitting_drake.policies.matching.evidence import fit_quality
 from kitting_drake.policies.matching.regions.placed_object import at_pixel, held_outside
 from kitting_drake.policies.matching.regions.segmentation import Region
 from kitting_drake.policies.matching.registration import Registration, trace_outline
