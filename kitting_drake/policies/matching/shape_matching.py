@@ -121,7 +121,8 @@ def insertions(
 ) -> Iterator[Matched]:
     """Yields the insertion of each object that fits into a recess, best fit first.
 
-    An insertion is a stop with a reason if the jaws lack room, or if too little is seen.
+    An insertion is a stop with a reason if the jaws lack room, if they would hold too much that
+    would lie outside the recess, or if too little is seen.
 
     Args:
         inventory: the objects and recesses of the observation.
