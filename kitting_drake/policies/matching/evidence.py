@@ -52,7 +52,7 @@ heights of tool and recess then differ by this, in metres: the median of the rig
 _FAR = 20.0
 """Upper limit of the distance from other objects, in mm."""
 _MOST_OUTSIDE = 0.5
-"""Upper limit of `held_outside`. More does not make an action less likely to succeed."""
+"""Upper limit of `held_outside`, as a share."""
 _SAME_ROTATION = math.radians(8)
 """Rotations closer than this angle count as the same."""
 _OTHER_ROTATION = math.radians(25)
