@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from systems.signals import Observation, PixelGrid
-from systems.table_plane import level
+from systems.surface_edges import surface_edges
+from systems.table_plane import level, plane_heights
 
 _DEEPEST = 0.05
 """Points more than this below `grid.z_min`, in metres, are ignored."""
@@ -96,20 +97,31 @@ def project(
             count as out of view.
     """
     in_view = np.any([looks_at(view, grid) for view in views], axis=0)
-    image, valid = _fuse(np.stack([_see(view, grid) for view in views]))
+    images, edges = zip(*(_see(view, grid) for view in views), strict=True)
+    image, valid = _fuse(np.stack(images))
+    edge_height = np.max(edges, axis=0)
     if region is not None:
         in_view &= region
         valid &= region
     image[3], table = level(image[3], valid & in_view, grid.resolution)
+    edge_height -= plane_heights(table, grid.shape)
     image[:3, ~valid] = 0
     image[3] = np.where(valid, np.maximum(image[3], 0), 0)
     _bridge_gaps(image, valid)
     if region is not None:
         image[:, ~region] = 0
         valid &= region
-    for array in (image, valid, in_view):
+        edge_height[~region] = -np.inf
+    for array in (image, valid, in_view, edge_height):
         array.flags.writeable = False
-    return Observation(image=image, grid=grid, valid=valid, in_view=in_view, table=table)
+    return Observation(
+        image=image,
+        grid=grid,
+        valid=valid,
+        in_view=in_view,
+        edge_height=edge_height,
+        table=table,
+    )
 
 
 def looks_at(view: View, grid: PixelGrid) -> NDArray[np.bool_]:
@@ -131,15 +143,18 @@ def looks_at(view: View, grid: PixelGrid) -> NDArray[np.bool_]:
     return inside
 
 
-def _see(view: View, grid: PixelGrid) -> NDArray[np.float32]:
-    """One camera's heightmap, (4, rows, cols): red, green, blue, and the height above `grid.z_min`.
+def _see(view: View, grid: PixelGrid) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """One camera's heightmap, (4, rows, cols): red, green, blue, and the height above `grid.z_min`;
+    and the heights of the edges of surfaces (rows, cols), see `surface_edges`.
 
-    The height is -inf where nothing is seen.
+    Heights are -inf where nothing is seen.
 
     The rigid transform and `PixelGrid.to_pixel` are affine. They are applied once, to the camera's
     centre and axes; the grid coordinates of a pixel are then linear in its depth.
     """
-    rays, depth = view.rays, view.depth
+    rays = view.rays
+    in_range = (view.depth >= rays.min_depth) & (view.depth <= rays.max_depth)
+    depth = np.where(in_range, view.depth, np.float32(np.nan))
     p_WD = view.X_WD[:3, 3]
     # World points one metre from the camera along each axis of D.
     ends = view.X_WD[:3, :3].T + p_WD
@@ -154,20 +169,15 @@ def _see(view: View, grid: PixelGrid) -> NDArray[np.float32]:
         direction += np.float32(origin[k])
         return direction
 
-    with np.errstate(invalid="ignore", over="ignore"):
-        row, col, z = coordinate(0), coordinate(1), coordinate(2)
-    point = np.flatnonzero(
-        (depth >= rays.min_depth)
-        & (depth <= rays.max_depth)
-        & (row >= 0)
-        & (row < grid.rows)
-        & (col >= 0)
-        & (col < grid.cols)
-        & (z <= grid.z_max - grid.z_min)
-        & (z >= -_DEEPEST)
-    )
-    row, col, z = (values.ravel()[point] for values in (row, col, z))
-    cell = row.astype(np.int64) * grid.cols + col.astype(np.int64)
+    row, col, z = coordinate(0), coordinate(1), coordinate(2)
+    X_GD = np.column_stack([axes.T, origin])
+    edge_row, edge_col, edge_z = surface_edges(depth, z, (rays.u, rays.v), X_GD).T
+    at_edge, cell = _cells(edge_row, edge_col, edge_z, grid)
+    edges = np.full(grid.rows * grid.cols, -np.inf, np.float32)
+    np.maximum.at(edges, cell, edge_z[at_edge].astype(np.float32))
+
+    point, cell = _cells(row, col, z, grid)
+    z = z.ravel()[point]
 
     # Rounding may put points of the table slightly below it. They get height 0, so that all points
     # of the table are equally high, and the last of them gives the colour. Adding 0 turns -0 into
@@ -189,7 +199,24 @@ def _see(view: View, grid: PixelGrid) -> NDArray[np.float32]:
         seen_image[:3, seen] = color[highest[seen] & 0xFFFFFFFF, :3].T / np.float32(255)
     bits = _sortable((highest[seen] >> 32).astype(np.int32).view(np.float32))
     seen_image[3, seen] = bits.view(np.float32)
-    return seen_image.reshape(4, *grid.shape)
+    return seen_image.reshape(4, *grid.shape), edges.reshape(grid.shape)
+
+
+def _cells(
+    row: NDArray[np.floating], col: NDArray[np.floating], z: NDArray[np.floating], grid: PixelGrid
+) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
+    """Returns the (flat) indices of the points on the grid, and for each of these the number of its
+    grid pixel."""
+    point = np.flatnonzero(
+        (row >= 0)
+        & (row < grid.rows)
+        & (col >= 0)
+        & (col < grid.cols)
+        & (z <= grid.z_max - grid.z_min)
+        & (z >= -_DEEPEST)
+    )
+    row, col = row.ravel()[point], col.ravel()[point]
+    return point, row.astype(np.int64) * grid.cols + col.astype(np.int64)
 
 
 def _sortable(values: NDArray[np.float32]) -> NDArray[np.int32]:

@@ -43,9 +43,16 @@ def level(
     table = find_table(height, seen, resolution)
     if not any(table):
         return height, table
-    rows, cols = np.indices(height.shape)
-    plane = table[0] * rows + table[1] * cols + table[2]
-    return (height - plane).astype(np.float32), table
+    return (height - plane_heights(table, height.shape)).astype(np.float32), table
+
+
+def plane_heights(
+    plane: NDArray[np.float64] | tuple[float, float, float], shape: tuple[int, ...]
+) -> NDArray[np.float64]:
+    """Returns the heights (rows, cols) of a plane, whose height at (row, col) is `plane @ (row,
+    col, 1)`."""
+    rows, cols = np.indices(shape, sparse=True)
+    return np.asarray(plane[0] * rows + plane[1] * cols + plane[2])
 
 
 def find_table(

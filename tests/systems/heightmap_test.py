@@ -1,5 +1,7 @@
 """o_t from depth images: pixels that are seen, pixels within the view, and levelling."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -28,6 +30,44 @@ def flat(
     depth = np.where(on_box, top, table)
     depth = depth + noise * np.random.default_rng(0).standard_normal(depth.shape)
     return View(None, depth.astype(np.float32), X_WD, rays)
+
+
+def aslant(middle: tuple[float, float]) -> View:
+    """The view of a camera that looks at 45 degrees along +x, of a box of 80 x 60 x 30 mm on the
+    table."""
+    s = math.sqrt(0.5)
+    X_WD = np.array([[0, -s, s, -0.1], [-1, 0, 0, 0], [0, -s, -s, 0.6], [0, 0, 0, 1]])
+    rays = DepthRays.from_pinhole(
+        size=(640, 480), focal=(520, 520), centre=(320, 240), depth_range=(0.01, 10)
+    )
+    u, v = np.broadcast_arrays(rays.u, rays.v)
+    along = np.stack([u, v, np.ones_like(u)], -1) @ X_WD[:3, :3].T
+    low, high = np.array([*middle, 0.015]) + np.outer((-1, 1), (0.04, 0.03, 0.015))
+    with np.errstate(divide="ignore"):
+        ends = np.stack([(end - X_WD[:3, 3]) / along for end in (low, high)])
+    enter, leave = ends.min(axis=0).max(axis=-1), ends.max(axis=0).min(axis=-1)
+    table = -X_WD[2, 3] / along[..., 2]
+    depth = np.where(enter < leave, enter, table)
+    return View(None, depth.astype(np.float32), X_WD, rays)
+
+
+def test_outlines_reach_to_the_edges_that_an_oblique_camera_sees():
+    offsets = {"height": [], "outline_height": []}
+    for middle in np.random.default_rng(0).uniform((0.4, -0.1), (0.5, 0.1), (20, 2)):
+        seen = project([aslant(tuple(middle))], GRID)
+        for name, found in offsets.items():
+            pixels = np.argwhere(getattr(seen, name) > 0.015)
+            found.append(GRID.to_world(pixels.mean(axis=0)) - middle)
+    plain, outlined = (np.mean(found, axis=0) for found in offsets.values())
+    assert plain[0] < -0.0004
+    np.testing.assert_allclose(outlined, 0, atol=0.0002)
+
+
+def test_outlines_without_known_edges_are_those_of_the_heights():
+    seen = project([aslant((0.45, 0.0))], GRID)
+    stored = Observation(seen.image, GRID, seen.valid, seen.in_view)
+    np.testing.assert_array_equal(stored.outline_height, seen.filled_height)
+    np.testing.assert_array_equal(stored.outline_valid, seen.valid)
 
 
 def test_pixels_outside_all_images_are_out_of_view():

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError
 
+from systems.table_plane import plane_heights
+
 Mask = NDArray[np.bool_]
 Plane = NDArray[np.float64]
 """(3,): the height at (row, col) is `plane @ (row, col, 1)`, in metres."""
@@ -77,11 +79,6 @@ class AreaLimits:
             object=min(least, _LEAST_CLEAN_AREA) if clean else least,
             protruding=scale * _LEAST_PROTRUDING,
         )
-
-
-def plane_heights(plane: Plane, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Returns the heights (rows, cols) of a plane, in metres."""
-    return plane[0] * np.arange(shape[0])[:, None] + plane[1] * np.arange(shape[1]) + plane[2]
 
 
 def _fit_plane(height: NDArray[np.float32], start: float, where: Mask) -> Plane:

@@ -26,10 +26,10 @@ from kitting_drake.policies.matching.regions.fixtures import (
     Mask,
     find_fixtures,
     fit_table,
-    plane_heights,
 )
 from kitting_drake.policies.matching.regions.visibility import Visibility
 from systems.signals import Observation
+from systems.table_plane import plane_heights
 
 _OBJECT_HEIGHT = 0.003
 """The least height of an object above the table, in metres."""
@@ -222,7 +222,7 @@ def segment(observation: Observation) -> Segmentation:
         kits count as one fixture.
     """
     resolution = observation.grid.resolution
-    height = observation.filled_height
+    height = observation.outline_height
     table = fit_table(height)
     relief = (height - plane_heights(table, height.shape)).astype(np.float32)
     fixtures = find_fixtures(height, relief, resolution)
@@ -248,7 +248,7 @@ def segment(observation: Observation) -> Segmentation:
         inside = ndimage.distance_transform_edt(fixture) > margin / 2
         depth[~inside] = 0
         # Add each unseen region to the recess that it touches.
-        hidden = inside & ~observation.valid
+        hidden = inside & ~observation.outline_valid
     # With noise, the highest pixel is no measure of the top.
     highest = float(np.percentile(relief[fixture], 75)) if fixture.any() else 0.0
     deep = depth > max(RECESS_DEPTH, _CLEARLY * noise)
