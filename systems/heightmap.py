@@ -99,29 +99,23 @@ def project(
     in_view = np.any([looks_at(view, grid) for view in views], axis=0)
     images, edges = zip(*(_see(view, grid) for view in views), strict=True)
     image, valid = _fuse(np.stack(images))
-    edge_height = np.max(edges, axis=0)
     if region is not None:
         in_view &= region
         valid &= region
     image[3], table = level(image[3], valid & in_view, grid.resolution)
+    edge_height = np.max(edges, axis=0)
     edge_height -= plane_heights(table, grid.shape)
+    np.maximum(edge_height, 0, out=edge_height)
     image[:3, ~valid] = 0
     image[3] = np.where(valid, np.maximum(image[3], 0), 0)
     _bridge_gaps(image, valid)
     if region is not None:
         image[:, ~region] = 0
         valid &= region
-        edge_height[~region] = -np.inf
+        edge_height[~region] = 0
     for array in (image, valid, in_view, edge_height):
         array.flags.writeable = False
-    return Observation(
-        image=image,
-        grid=grid,
-        valid=valid,
-        in_view=in_view,
-        edge_height=edge_height,
-        table=table,
-    )
+    return Observation(image, grid, valid, in_view, edge_height, table)
 
 
 def looks_at(view: View, grid: PixelGrid) -> NDArray[np.bool_]:

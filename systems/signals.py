@@ -98,9 +98,9 @@ class Observation:
     in_view: NDArray[np.bool_] = None  # type: ignore[assignment]
     """(rows, cols) mask of the pixels in some camera's field of view, whether or not something
     hides them. Default: all pixels."""
-    edge_height: NDArray[np.float32] | None = None
-    """(rows, cols) heights of the edges of surfaces, in metres above `grid.z_min`, minus infinity
-    where there is none (see `surface_edges`). None if they are unknown."""
+    edge_height: NDArray[np.float32] = None  # type: ignore[assignment]
+    """(rows, cols) heights of the edges of surfaces, in metres above `grid.z_min` (see
+    `surface_edges`); zero where there is none. Default: no edges."""
     table: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """The table's plane, which was subtracted from the heights: at (row, col) it lay
     `table @ (row, col, 1)` metres above `grid.z_min`."""
@@ -112,6 +112,9 @@ class Observation:
             object.__setattr__(self, "valid", self.image.any(axis=0))
         if self.in_view is None:
             object.__setattr__(self, "in_view", np.ones(self.image.shape[1:], bool))
+        if self.edge_height is None:
+            edges = np.zeros(self.image.shape[1:], np.float32)
+            object.__setattr__(self, "edge_height", edges)
 
     @property
     def rgb(self) -> NDArray[np.float32]:
@@ -132,17 +135,13 @@ class Observation:
     def outline_height(self) -> NDArray[np.float32]:
         """(rows, cols): as `filled_height`, but each surface reaches to its edge. In `height` it
         may end half a sample before, on the side that faces away from the camera."""
-        if self.edge_height is None:
-            return self.filled_height
-        height = np.maximum(self.height, np.maximum(self.edge_height, 0))
+        height = np.maximum(self.height, self.edge_height)
         return fill_unseen(height, self.outline_valid, self.in_view)
 
     @cached_property
     def outline_valid(self) -> NDArray[np.bool_]:
         """(rows, cols) mask of the pixels with a measured `outline_height`."""
-        if self.edge_height is None:
-            return self.valid
-        return np.asarray(self.valid | (self.edge_height > -np.inf))
+        return np.asarray(self.valid | (self.edge_height > 0))
 
 
 _FILL_REACH = 25

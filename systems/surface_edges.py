@@ -1,10 +1,10 @@
 """Finds where surfaces end in a depth image, more precisely than to a sample.
 
-A camera sees a surface at samples. Where the surface ends and something lower begins behind it, the
-edge lies between two samples, on average midway. So the surface looks too short there, by half the
-distance of the samples. On the side that faces the camera this does not happen, because the wall
-below the edge is seen. With one oblique camera, objects and recesses therefore seem nearer to the
-camera than they are, by up to about 1 mm.
+A camera sees a surface at samples. Where the surface ends on the side that faces away from the
+camera, the edge lies between two samples, on average midway. So the surface looks too short there,
+by half the distance of the samples. On the side that faces the camera this does not happen, because
+the wall below the edge is seen. With one oblique camera, objects and recesses therefore seem nearer
+to the camera than they are, by up to about 1 mm.
 """
 
 from __future__ import annotations
@@ -18,6 +18,9 @@ _LEVEL = 0.005
 """A surface is level at two pixels if their heights differ by less than this, in metres."""
 _LOWER = 0.002
 """What begins behind a surface's edge is lower than the surface by more than this, in metres."""
+_AHEAD = 0.5
+"""An edge faces away from the camera if the cosine between the step to the lower pixel and the
+direction away from the camera, seen from above, is more than this."""
 
 
 def surface_edges(
@@ -26,10 +29,11 @@ def surface_edges(
     rays: tuple[NDArray[np.float32], NDArray[np.float32]],
     X_GD: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Returns points at the edges of level surfaces.
+    """Returns points at the edges of level surfaces that face away from an oblique camera.
 
     Where a surface ends between two neighbouring pixels, the point is midway between their rays, at
-    the height of the surface.
+    the height of the surface. There are such points only where the camera's view is so oblique that
+    it hides more than the distance of two samples.
 
     Args:
         depth: (height, width) depth of each pixel along the optical axis, in metres; NaN where
@@ -64,7 +68,15 @@ def surface_edges(
         found.append((upper[level], (upper + step)[level]))
     upper, lower = (np.concatenate(part) for part in zip(*found, strict=True))
     row, col = np.divmod(np.stack([upper, lower]), width)
-    u, v = (np.broadcast_to(ray, height.shape)[row, col].mean(axis=0) for ray in rays)
-    along = np.stack([u, v, np.ones(len(u))], axis=-1) @ X_GD[:, :3].T
-    reach = (z[upper] - X_GD[2, 3]) / along[:, 2]
-    return reach[:, None] * along + X_GD[:, 3]
+    u, v = (np.broadcast_to(ray, depth.shape)[row, col] for ray in rays)
+    # Add the rays midway between the two pixels, and follow all rays to the height of the surface.
+    along = np.stack([[u[0], u.mean(axis=0)], [v[0], v.mean(axis=0)]], axis=-1)
+    along = along @ X_GD[:, :2].T + X_GD[:, 2]
+    along *= ((z[upper] - X_GD[2, 3]) / along[..., 2])[..., None]
+    sample, edge = along
+    away, step = sample[:, :2], (edge - sample)[:, :2]
+    far, half = np.linalg.norm(away, axis=1), np.linalg.norm(step, axis=1)
+    # The surface hides as much of what lies below it as a camera sees of a wall that is as high.
+    hidden = far * (z[upper] - z[lower]) / np.abs(sample[:, 2])
+    ahead = (step * away).sum(axis=1) > _AHEAD * far * half
+    return edge[ahead & (hidden > 2 * half)] + X_GD[:, 3]

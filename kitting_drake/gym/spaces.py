@@ -32,6 +32,7 @@ def observation_space(scenario: Scenario, *, cameras: bool) -> spaces.Dict:
     - `colour` (rows, cols, 3);
     - `height` (rows, cols), in metres above `heightmap.z_min`, by default the table;
     - `valid` and `in_view` (rows, cols);
+    - `edge_height` (rows, cols), in metres like `height`;
     - `cameras`, if requested: for each camera `colour` (height, width, 3), and `depth` (height,
       width) in metres. Depth is 0 for points that are too near, and infinite for points too far.
     """
@@ -42,6 +43,7 @@ def observation_space(scenario: Scenario, *, cameras: bool) -> spaces.Dict:
         "height": spaces.Box(0.0, float(np.float32(depth_range)), grid.shape, np.float32),
         "valid": spaces.MultiBinary(grid.shape),
         "in_view": spaces.MultiBinary(grid.shape),
+        "edge_height": spaces.Box(0.0, float(np.float32(depth_range)), grid.shape, np.float32),
     }
     if cameras:
         images: dict[str, spaces.Space[Any]] = {
@@ -65,6 +67,7 @@ def as_arrays(observation: Observation) -> dict[str, NDArray[Any]]:
         "height": observation.height.copy(),
         "valid": observation.valid.astype(np.int8),
         "in_view": observation.in_view.astype(np.int8),
+        "edge_height": observation.edge_height.copy(),
     }
 
 
@@ -78,7 +81,8 @@ def as_observation(arrays: dict[str, Any], grid: PixelGrid) -> Observation:
     rgb = np.moveaxis(np.asarray(arrays["colour"], np.float32) / np.float32(255), -1, 0)
     image = np.concatenate([rgb, np.asarray(arrays["height"], np.float32)[None]])
     valid, in_view = (np.asarray(arrays[name], bool) for name in ("valid", "in_view"))
-    return Observation(image=image, grid=grid, valid=valid, in_view=in_view)
+    edge_height = np.asarray(arrays["edge_height"], np.float32)
+    return Observation(image, grid, valid, in_view, edge_height)
 
 
 def as_action(values: ArrayLike, grid: PixelGrid) -> PickPlaceAction:

@@ -80,11 +80,15 @@ def departures(results: Mapping[str, Result]) -> str:
             "1000 to 3000; the learning rate rises, then falls",
             _compared(
                 results,
-                "success of our method on the pyramid, with three times the steps",
+                "success of our method with three times the steps",
                 {
-                    f"N = {n}": (f"{name}_3_times_the_steps", name)
+                    f"{label}, N = {n}": (f"{name}_3_times_the_steps", name)
+                    for label, task, count in (
+                        ("pyramid", "stack_block_pyramid", 100),
+                        ("place red in green, one demonstration", "place_red_in_green", 1),
+                    )
                     for n in (180, 36)
-                    for name in (f"stack_block_pyramid_so2_{n}_100",)
+                    for name in (f"{task}_so2_{n}_{count}",)
                 },
             ),
         ),
