@@ -163,9 +163,10 @@ def _see(view: View, grid: PixelGrid) -> tuple[NDArray[np.float32], NDArray[np.f
         direction += np.float32(origin[k])
         return direction
 
-    row, col, z = coordinate(0), coordinate(1), coordinate(2)
     X_GD = np.column_stack([axes.T, origin])
-    edge_row, edge_col, edge_z = surface_edges(depth, z, (rays.u, rays.v), X_GD).T
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        row, col, z = coordinate(0), coordinate(1), coordinate(2)
+        edge_row, edge_col, edge_z = surface_edges(depth, z, (rays.u, rays.v), X_GD).T
     at_edge, cell = _cells(edge_row, edge_col, edge_z, grid)
     edges = np.full(grid.rows * grid.cols, -np.inf, np.float32)
     np.maximum.at(edges, cell, edge_z[at_edge].astype(np.float32))

@@ -169,8 +169,14 @@ def test_the_sentences_of_the_readme(runs: dict[str, Summary], readme: str):
         for name in ("stack_block_pyramid_so2_36_100", "stack_block_pyramid_so2_36_100_ours")
     )
     assert f"reaches {plain:.1f} % here. The same weights reach {extended:.1f} % with our" in text
-    red = [percent(runs, f"place_red_in_green_so2_{n}_1") for n in (36, 180)]
-    assert f"place red in green ({red[0]} and {red[1]} %, at N = 36 and 180)" in text
+    red, longer = (
+        [percent(runs, f"place_red_in_green_so2_{n}_1{steps}") for n in (36, 180)]
+        for steps in ("", "_3_times_the_steps")
+    )
+    assert (
+        f"place red in green ({red[0]} and {red[1]} %, at N = 36 and 180; "
+        f"{longer[0]} and {longer[1]} % with three times the training steps)"
+    ) in text
     pyramid, boxes = (
         [f"{100 * float(runs[f'{task}_so2_{n}_1']['success_rate']):.1f}" for n in orientations]
         for task, orientations in (("stack_block_pyramid", (36, 180)), ("palletizing_boxes", (36,)))
