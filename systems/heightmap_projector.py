@@ -55,9 +55,9 @@ class HeightmapProjector(LeafSystem):
       other. It gets the mean of these two neighbours. If the neighbours along x and those along y
       qualify, it gets the larger mean. Wider gaps (shadows) remain zero in all four channels and
       are not `valid`.
-    - Where a surface ends on the side that faces away from an oblique camera, the edge is midway
-      between two samples. The heights of these edges are in `edge_height` (see `surface_edges`),
-      not in the image.
+    - Where a surface ends on the side that faces away from an oblique camera, the edge is assumed
+      to be midway between two samples. The heights of these edges are in `edge_height` (see
+      `surface_edges`), not in the image.
 
     The colour camera must be registered with the depth camera: same intrinsics, same pose.
     """

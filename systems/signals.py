@@ -100,7 +100,8 @@ class Observation:
     hides them. Default: all pixels."""
     edge_height: NDArray[np.float32] = None  # type: ignore[assignment]
     """(rows, cols) heights of the edges of surfaces, in metres above `grid.z_min` (see
-    `surface_edges`); zero where there is none. Default: no edges."""
+    `surface_edges`); zero where there is none. They belong to `image`: replace both together.
+    Default: no edges."""
     table: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """The table's plane, which was subtracted from the heights: at (row, col) it lay
     `table @ (row, col, 1)` metres above `grid.z_min`."""
@@ -134,13 +135,17 @@ class Observation:
     @cached_property
     def outline_height(self) -> NDArray[np.float32]:
         """(rows, cols): as `filled_height`, but each surface reaches to its edge. In `height` it
-        may end half a sample before, on the side that faces away from the camera."""
-        height = np.maximum(self.height, self.edge_height)
-        return fill_unseen(height, self.outline_valid, self.in_view)
+        ends half the distance of two samples before, on the side that faces away from an oblique
+        camera."""
+        edges = self.edge_height > 0
+        if not edges.any():
+            return self.filled_height
+        filled = fill_unseen(self.height, self.valid, self.in_view, edges)
+        return np.maximum(filled, self.edge_height)
 
     @cached_property
     def outline_valid(self) -> NDArray[np.bool_]:
-        """(rows, cols) mask of the pixels with a measured `outline_height`."""
+        """(rows, cols) mask of the pixels that are `valid` or have an edge."""
         return np.asarray(self.valid | (self.edge_height > 0))
 
 
@@ -158,19 +163,21 @@ def fill_unseen(
     height: NDArray[np.float32],
     valid: NDArray[np.bool_],
     in_view: NDArray[np.bool_] | None = None,
+    edges: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.float32]:
     """Fills the heights of unseen pixels.
 
     A hidden surface is lower than the surface that hides it. So a wide hole is filled from the
-    lowest seen pixels around it: each of its pixels gets the height of the nearest of these. A
-    narrow hole is filled from its border inwards, each pixel with the height of its lowest
-    neighbour. Pixels outside all views, or deep in a large hole, get the table's height, zero,
-    because nothing is known about them.
+    lowest seen pixels around it: each of its pixels gets the height of the nearest of these. So is
+    a hole beside an edge, because the edge hides it. Any other narrow hole is filled from its
+    border inwards, each pixel with the height of its lowest neighbour. Pixels outside all views, or
+    deep in a large hole, get the table's height, zero, because nothing is known about them.
 
     Args:
         height: (rows, cols), in metres above the table.
         valid: (rows, cols) mask of the pixels with a measured height.
         in_view: (rows, cols) mask of the pixels in a camera's field of view; None for all pixels.
+        edges: (rows, cols) mask of the known edges; None if there are none.
     """
     if valid.all() or not valid.any():
         return height
@@ -179,7 +186,13 @@ def fill_unseen(
 
     filled = np.where(valid, height, np.inf).astype(np.float32)
     holes = ~valid if in_view is None else ~valid & in_view
-    _fill_shadows(filled, ndimage.binary_opening(holes, _SHADOW))
+    shadows = ndimage.binary_opening(holes, _SHADOW)
+    if edges is not None:
+        labels, count = ndimage.label(holes, np.ones((3, 3), bool))
+        is_shadow = np.zeros(count + 1, bool)
+        is_shadow[labels[ndimage.binary_dilation(edges, np.ones((3, 3), bool))]] = True
+        shadows |= is_shadow[labels] & holes
+    _fill_shadows(filled, shadows)
     for _ in range(_FILL_REACH):
         missing = holes & ~np.isfinite(filled)
         if not missing.any():

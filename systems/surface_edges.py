@@ -32,8 +32,9 @@ def surface_edges(
     """Returns points at the edges of level surfaces that face away from an oblique camera.
 
     Where a surface ends between two neighbouring pixels, the point is midway between their rays, at
-    the height of the surface. There are such points only where the camera's view is so oblique that
-    it hides more than the distance of two samples.
+    the height of the surface. There is such a point only if the strip that the surface hides is
+    wider than the distance of two samples, and if the depth grows by 8 mm or more. At 45 degrees,
+    that is the case for surfaces that are 6 mm or more above what lies behind.
 
     Args:
         depth: (height, width) depth of each pixel along the optical axis, in metres; NaN where
@@ -74,9 +75,9 @@ def surface_edges(
     along = along @ X_GD[:, :2].T + X_GD[:, 2]
     along *= ((z[upper] - X_GD[2, 3]) / along[..., 2])[..., None]
     sample, edge = along
-    away, step = sample[:, :2], (edge - sample)[:, :2]
-    far, half = np.linalg.norm(away, axis=1), np.linalg.norm(step, axis=1)
-    # The surface hides as much of what lies below it as a camera sees of a wall that is as high.
+    away, forward = sample[:, :2], (edge - sample)[:, :2]
+    far, half = np.linalg.norm(away, axis=1), np.linalg.norm(forward, axis=1)
+    # The width of the strip that the surface hides. A wall of this height is seen as wide.
     hidden = far * (z[upper] - z[lower]) / np.abs(sample[:, 2])
-    ahead = (step * away).sum(axis=1) > _AHEAD * far * half
+    ahead = (forward * away).sum(axis=1) > _AHEAD * far * half
     return edge[ahead & (hidden > 2 * half)] + X_GD[:, 3]

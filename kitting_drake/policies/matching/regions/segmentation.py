@@ -259,7 +259,7 @@ def segment(observation: Observation) -> Segmentation:
             for item in _regions(loose, relief, resolution, areas.object)
             # Ignore regions of mostly unseen pixels: in the shadow of a block, a few wrong depths
             # can make the filled-in heights look like an object.
-            if observation.valid[item.mask].mean() > _OBJECT_SEEN
+            if observation.outline_valid[item.mask].mean() > _OBJECT_SEEN
             and not _is_corner(item, fixture, relief, highest, resolution)
         ),
         recesses=_regions(deep | hidden, depth, resolution, areas.recess, core=deep),
