@@ -114,7 +114,7 @@ def test_recovers_when_the_cell_does(high: float, scene: Rendered):
     top = float(np.median(seen.height[fixture]))
     row, col = int(rows.mean()), cols.min() + 3
     image[3, row : row + 4, col : col + 26] = top + high
-    seen = dataclasses.replace(seen, image=image)
+    seen = dataclasses.replace(seen, image=image, edge_height=None)
     assert recovery_action(Inventory.of(seen), PickPlaceParameters()) is not None
     # Few orientations are faster.
     few: dict[str, Any] = {"orientations": 36, "recover": True}

@@ -32,35 +32,80 @@ def flat(
     return View(None, depth.astype(np.float32), X_WD, rays)
 
 
-def aslant(middle: tuple[float, float]) -> View:
-    """The view of a camera that looks at 45 degrees along +x, of a box of 80 x 60 x 30 mm on the
-    table."""
-    s = math.sqrt(0.5)
-    X_WD = np.array([[0, -s, s, -0.1], [-1, 0, 0, 0], [0, -s, -s, 0.6], [0, 0, 0, 1]])
+def aslant(
+    middle: tuple[float, float],
+    kind: str = "box",
+    degrees: float = 45,
+    height: float = 0.03,
+    length: float = 0.08,
+) -> View:
+    """The view of a camera that looks along +x and down, at an angle to the vertical, from 0.8 m
+    away. It sees a box on the table, 60 mm wide, or a pocket of this size in a block."""
+    s, c = math.sin(math.radians(degrees)), math.cos(math.radians(degrees))
+    X_WD = np.array([[0, -c, s, 0.45 - 0.8 * s], [-1, 0, 0, 0], [0, -s, -c, 0.8 * c], [0, 0, 0, 1]])
     rays = DepthRays.from_pinhole(
         size=(640, 480), focal=(520, 520), centre=(320, 240), depth_range=(0.01, 10)
     )
     u, v = np.broadcast_arrays(rays.u, rays.v)
     along = np.stack([u, v, np.ones_like(u)], -1) @ X_WD[:3, :3].T
-    low, high = np.array([*middle, 0.015]) + np.outer((-1, 1), (0.04, 0.03, 0.015))
+    low, high = np.array([*middle, height / 2]) + np.outer((-1, 1), (length / 2, 0.03, height / 2))
     with np.errstate(divide="ignore"):
         ends = np.stack([(end - X_WD[:3, 3]) / along for end in (low, high)])
     enter, leave = ends.min(axis=0).max(axis=-1), ends.max(axis=0).min(axis=-1)
-    table = -X_WD[2, 3] / along[..., 2]
-    depth = np.where(enter < leave, enter, table)
+    table, top = ((z - X_WD[2, 3]) / along[..., 2] for z in (0, height))
+    if kind == "box":
+        depth = np.where(enter < leave, enter, table)
+    else:
+        # A ray that enters the pocket through its open top leaves it at a wall or at the floor.
+        depth = np.where((enter < leave) & (np.abs(enter - top) < 1e-9), leave, top)
     return View(None, depth.astype(np.float32), X_WD, rays)
 
 
-def test_outlines_reach_to_the_edges_that_an_oblique_camera_sees():
-    offsets = {"height": [], "outline_height": []}
-    for middle in np.random.default_rng(0).uniform((0.4, -0.1), (0.5, 0.1), (20, 2)):
-        seen = project([aslant(tuple(middle))], GRID)
-        for name, found in offsets.items():
-            pixels = np.argwhere(getattr(seen, name) > 0.015)
-            found.append(GRID.to_world(pixels.mean(axis=0)) - middle)
-    plain, outlined = (np.mean(found, axis=0) for found in offsets.values())
-    assert plain[0] < -0.0004
-    np.testing.assert_allclose(outlined, 0, atol=0.0002)
+@pytest.mark.parametrize("kind", ["box", "pocket"])
+@pytest.mark.parametrize(("degrees", "height"), [(30, 0.015), (45, 0.01), (60, 0.02)])
+def test_an_oblique_camera_sees_outlines_where_they_are(kind: str, degrees: float, height: float):
+    away = []
+    for middle in np.random.default_rng(0).uniform((0.42, -0.05), (0.48, 0.05), (16, 2)):
+        seen = project([aslant((middle[0], middle[1]), kind, degrees, height)], GRID)
+        pixels = np.argwhere((seen.outline_height > height / 2) == (kind == "box"))
+        offsets = GRID.to_world(pixels) - middle
+        away.append(offsets[np.abs(offsets).max(axis=1) < 0.06].mean(axis=0))
+    np.testing.assert_allclose(np.mean(away, axis=0), 0, atol=0.0004)
+
+
+def test_without_edges_an_oblique_camera_shifts_what_it_sees():
+    """This is why there are edges."""
+    views = [aslant((x, 0.0)) for x in np.linspace(0.42, 0.48, 16)]
+    found = [project([view], GRID).filled_height > 0.015 for view in views]
+    middles = [GRID.to_world(np.argwhere(mask).mean(axis=0))[0] for mask in found]
+    assert np.mean(middles) < 0.45 - 0.0002
+
+
+def test_a_thin_rod_across_the_view_is_seen():
+    for x in np.linspace(0.45, 0.453, 8):
+        seen = project([aslant((x, 0.0), height=0.01, length=0.003)], GRID)
+        rod = seen.outline_height > 0.003
+        assert rod.sum() > 15
+        assert seen.outline_valid[rod].mean() > 0.5
+
+
+def test_a_noisy_table_has_hardly_any_edges():
+    view = aslant((0.45, 0.0), height=1e-9)
+    noise = 0.001 * np.random.default_rng(0).standard_normal(view.depth.shape)
+    seen = project([view._replace(depth=(view.depth + noise).astype(np.float32))], GRID)
+    assert (seen.edge_height > 0).mean() < 0.001
+
+
+def test_edges_follow_the_level_of_the_table_and_the_region_of_interest():
+    view = aslant((0.45, 0.0))
+    lifted = view.X_WD + np.array([[0.0], [0], [0.006], [0]]) * [0, 0, 0, 1]
+    true, seen = (project([view._replace(X_WD=X)], GRID) for X in (view.X_WD, lifted))
+    assert seen.table[2] == pytest.approx(0.006, abs=5e-4)
+    edges = true.edge_height > 0
+    np.testing.assert_allclose(seen.edge_height[edges], true.edge_height[edges], atol=5e-4)
+    region = np.ones(GRID.shape, bool)
+    region[np.nonzero(edges.any(axis=1))[0][0] :] = False
+    assert not project([view], GRID, region).edge_height.any()
 
 
 def test_outlines_without_known_edges_are_those_of_the_heights():

@@ -247,7 +247,7 @@ def test_the_visible_parts_of_a_filled_recess_are_not_free():
     seated[30:54, 77:85] = 0.0465
     image = observation.image.copy()
     image[3] = seated
-    observation = dataclasses.replace(observation, image=image)
+    observation = dataclasses.replace(observation, image=image, edge_height=None)
     found = Inventory.of(observation)
     assert found.segmentation.kit_seen and not found.segmentation.unfilled_recesses
     action = ShapeMatchingPolicy(PLANNER, recover=True)(observation)
@@ -321,7 +321,7 @@ def test_an_object_that_is_its_own_mirror_image_is_never_reversed():
 def noisy(observation: Observation, deviation: float = 0.0015) -> Observation:
     image = observation.image.copy()
     image[3] += np.random.default_rng(0).normal(0.0, deviation, GRID.shape).astype(np.float32)
-    return dataclasses.replace(observation, image=image)
+    return dataclasses.replace(observation, image=image, edge_height=None)
 
 
 def test_with_noise_a_recess_that_was_filled_is_not_worth_a_try():

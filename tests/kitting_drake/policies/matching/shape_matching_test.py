@@ -112,7 +112,7 @@ def test_no_object_is_proposed_twice(degrees: float):
     c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
     along, across = (cols - 244) * c + (rows - 81) * s, (rows - 81) * c - (cols - 244) * s
     image[3, (abs(along) < 25) & (abs(across) < 3.5)] = 0.015
-    seen = dataclasses.replace(seen, image=image)
+    seen = dataclasses.replace(seen, image=image, edge_height=None)
     # Few orientations are faster.
     policy = LearnedPolicy(load_networks(GENERALIST), orientations=36, stages=FITTING)
     ((action, decision),) = policy.proposals(seen)
@@ -147,13 +147,13 @@ def test_takes_out_a_protruding_object_only_when_nothing_else_fits(seen):
     rows, cols = np.nonzero(segmentation.fixture)
     image = observation.image.copy()
     image[3, rows.min() + 3 : rows.min() + 7, cols.min() + 4 : cols.min() + 30] = top + 0.04
-    blocked = dataclasses.replace(observation, image=image)
+    blocked = dataclasses.replace(observation, image=image, edge_height=None)
     (standing,) = segment(blocked).protruding
     action = policy(blocked)
     assert not standing.mask[pixel_of(blocked, action)]
     for region in segment(blocked).objects:
         image[:, np.pad(region.mask, 2)[2:-2, 2:-2]] = image[:, :5, :5].mean(axis=(1, 2))[:, None]
-    action = policy(dataclasses.replace(blocked, image=image))
+    action = policy(dataclasses.replace(blocked, image=image, edge_height=None))
     assert not action.stop
     assert standing.mask[pixel_of(blocked, action)]
 
@@ -168,7 +168,7 @@ def test_stops_when_nothing_is_left(seen):
     image = observation.image.copy()
     for region in segment(observation).objects:
         image[:, np.pad(region.mask, 2)[2:-2, 2:-2]] = image[:, :5, :5].mean(axis=(1, 2))[:, None]
-    cleared = dataclasses.replace(observation, image=image)
+    cleared = dataclasses.replace(observation, image=image, edge_height=None)
     assert ShapeMatchingPolicy(PLANNER)(cleared).stop
     assert ShapeMatchingPolicy(PLANNER)(Observation()).stop
 

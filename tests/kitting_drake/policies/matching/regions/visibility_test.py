@@ -105,7 +105,7 @@ def test_a_stop_tells_why():
         image = whole.image.copy()
         for rows, cols, height in boxes:
             image[3, rows, cols] = height
-        return policy(dataclasses.replace(whole, image=image)).reason
+        return policy(dataclasses.replace(whole, image=image, edge_height=None)).reason
 
     everything = slice(None)
     assert reason((everything, everything, 0.0)) == "no kit seen"
@@ -120,6 +120,6 @@ def test_the_gaps_around_a_seated_object_are_no_free_recess():
     seen = kit_and_bar(None)
     image = seen.image.copy()
     image[3, 51:99, 91:97] = 0.058
-    found = segment(dataclasses.replace(seen, image=image))
+    found = segment(dataclasses.replace(seen, image=image, edge_height=None))
     assert found.kit_seen and not found.free_recesses
     assert segment(seen).free_recesses
