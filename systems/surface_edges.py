@@ -18,6 +18,9 @@ _LEVEL = 0.005
 """A surface is level at two pixels if their heights differ by less than this, in metres."""
 _LOWER = 0.002
 """What begins behind a surface's edge is lower than the surface by more than this, in metres."""
+_FARTHEST = 1.25
+"""Samples must be closer together than this many rows or columns. Otherwise there are gaps between
+the samples of a surface, and its edges say little."""
 _AHEAD = 0.5
 """An edge faces away from the camera if the cosine between the step to the lower pixel and the
 direction away from the camera, seen from above, is more than this."""
@@ -34,7 +37,8 @@ def surface_edges(
     Where a surface ends between two neighbouring pixels, the point is midway between their rays, at
     the height of the surface. There is such a point only if the strip that the surface hides is
     wider than the distance of two samples, and if the depth grows by 8 mm or more. At 45 degrees,
-    that is the case for surfaces that are 6 mm or more above what lies behind.
+    that is the case for surfaces that are 6 mm or more above what lies behind. There is none where
+    samples are 1.25 rows or columns apart or more.
 
     Args:
         depth: (height, width) depth of each pixel along the optical axis, in metres; NaN where
@@ -80,4 +84,5 @@ def surface_edges(
     # The width of the strip that the surface hides. A wall of this height is seen as wide.
     hidden = far * (z[upper] - z[lower]) / np.abs(sample[:, 2])
     ahead = (forward * away).sum(axis=1) > _AHEAD * far * half
-    return edge[ahead & (hidden > 2 * half)] + X_GD[:, 3]
+    dense = 2 * half < _FARTHEST
+    return edge[ahead & dense & (hidden > 2 * half)] + X_GD[:, 3]
