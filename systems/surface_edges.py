@@ -4,7 +4,7 @@ A camera sees a surface at samples. Where the surface ends on the side that face
 camera, the edge lies between two samples, on average midway. So the surface looks too short there,
 by half the distance of the samples. On the side that faces the camera this does not happen, because
 the wall below the edge is seen. With one oblique camera, objects and recesses therefore seem nearer
-to the camera than they are, by up to about 1 mm.
+to the camera than they are.
 """
 
 from __future__ import annotations
