@@ -180,11 +180,12 @@ def _reliability(arguments: argparse.Namespace, console: Console, folder: Path) 
     )
 
     _use_one_core()
-    measured = measure_reliability(
-        arguments.seed, arguments.scenes, arguments.weights, folder, console, fits=arguments.fit
-    )
-    write_json(folder / "reliability.json", measured)
-    write_atomically(folder / "reliability.png", draw_reliability(measured))
+    with alone_in(folder):
+        measured = measure_reliability(
+            arguments.seed, arguments.scenes, arguments.weights, folder, console, fits=arguments.fit
+        )
+        write_json(folder / "reliability.json", measured)
+        write_atomically(folder / "reliability.png", draw_reliability(measured))
     return [reliability_table(measured)]
 
 

@@ -133,7 +133,8 @@ def _add_mujoco(benchmarks: Any) -> None:
 
 def _add_reliability(benchmarks: Any) -> None:
     reliability = benchmarks.add_parser(
-        "reliability", help="whether a decision's confidence is its probability of success"
+        "reliability",
+        help="whether a decision's confidence is its probability of success; run again to resume",
     )
     reliability.add_argument(
         "--scenes", type=count_type, default=100, help="number of scenes (100)"

@@ -6,8 +6,7 @@ by geometry (`judging`), without physics.
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -18,9 +17,15 @@ from numpy.typing import NDArray
 from rich.console import Console
 from scipy.optimize import minimize
 
-from kitting_drake.common.files import write_atomically, write_json
+from kitting_drake.common.files import (
+    append_line,
+    claim_folder,
+    files_digest,
+    read_lines,
+    write_json,
+)
 from kitting_drake.common.processes import counting_bar
-from kitting_drake.common.provenance import commit
+from kitting_drake.common.provenance import commit, versions
 from kitting_drake.policies.confidence import (
     MOST_PROPOSALS,
     Reliability,
@@ -59,6 +64,7 @@ probability of success, so the threshold follows from the cost of a wrong action
 _FOLDS, _FOLD = 6, 10
 """The number of parts in the cross-validation, and the number of successive scenes that stay in one
 part."""
+_LINES = "decisions.jsonl"
 _BINS = 10
 _SHRINKAGE = 10.0
 """The weight of half the squared coefficients in the fit, beside the sum of all decisions' losses.
@@ -91,26 +97,35 @@ def measure_reliability(
     *,
     fits: bool,
 ) -> dict[str, Any]:
-    """Measures how reliable the confidence of decisions is.
+    """Measures how reliable the confidence of decisions is. Scenes that are in the folder already
+    are skipped, so the same command resumes the work, and more `count` adds scenes.
 
     Args:
         first_seed: the seed of the first scene.
         count: the number of scenes.
         weights: the file of the networks; None for the generalist.
-        folder: the folder for `decisions.jsonl`, and for `confidence.json` if `fits`.
+        folder: the folder for `decisions.jsonl`, which has a line for each scene, and for
+            `confidence.json` if `fits`.
         console: the console for the progress.
         fits: whether to fit the confidence to these decisions; else the existing fit is used.
 
     Returns:
         A summary of each policy's decisions, by the number of cameras.
+
+    Raises:
+        UserError: the folder holds other files, or decisions of other scenes, networks or code.
     """
-    judged: list[Judged] = []
+    networks = None if weights is None else files_digest([weights])
+    described = {"seed": first_seed, "networks": networks, "commit": commit()} | versions()
+    claim_folder(folder, "decisions_of.json", described, of="seed, networks or version")
+    lines = read_lines(folder / _LINES)[:count]
+    judged = [Judged(**item) for line in lines for item in line]
     with counting_bar(console, "scenes") as progress:
-        bar = progress.add_task("", total=count)
-        for item in draw_judged(first_seed, count, weights):
-            judged.append(item)
-            progress.update(bar, completed=item.scene)
-    write_atomically(folder / "decisions.jsonl", "".join(line + "\n" for line in as_lines(judged)))
+        bar = progress.add_task("", total=count, completed=len(lines))
+        for found in draw_judged(first_seed, range(len(lines), count), weights):
+            append_line(folder / _LINES, [asdict(item) for item in found])
+            judged += found
+            progress.advance(bar)
     return summarize_all(judged, weights, folder if fits else None) | {
         "seeds": [first_seed, count],
         "commit": commit(),
@@ -169,14 +184,19 @@ def _cross_validated(judged: list[Judged]) -> list[float]:
     return confidences
 
 
-def draw_judged(first_seed: int, count: int, weights: Path | None = None) -> Iterator[Judged]:
-    """Yields the judged proposals of all `POLICIES` on scenes that are drawn at random.
+def draw_judged(
+    first_seed: int, numbers: range, weights: Path | None = None
+) -> Iterator[list[Judged]]:
+    """Yields, for each of the scenes that are drawn at random, the judged proposals of all
+    `POLICIES`.
 
     Args:
         first_seed: the seed of the first scene.
-        count: the number of scenes.
+        numbers: the successive numbers of the scenes; that of the first scene is 0.
         weights: the file of the networks; None for the generalist.
     """
+    if not numbers:
+        return
     planner = PickPlaceParameters()
     networks = load_learned_policy(weights, planner, insertion=True).function
     matching = make_shape_matching(planner)
@@ -195,15 +215,18 @@ def draw_judged(first_seed: int, count: int, weights: Path | None = None) -> Ite
         for matched in matching.proposals(seen):
             yield matched.action, matched.geometry or {}
 
-    for number, scene in zip(range(count), _scenes(first_seed), strict=False):
+    scenes = islice(_scenes(first_seed), numbers.start, None)
+    for number, scene in zip(numbers, scenes, strict=False):
         observation = scene.render(PixelGrid())
         cameras = len(scene.cameras) if scene.cameras != Scenario().cameras else 0
+        judged = []
         for policy, propose in (("networks", by_networks), ("shape_matching", by_matching)):
             for action, evidence in islice(propose(observation), MOST_PROPOSALS):
                 verdict = (
                     "stop" if action.stop else judge(action, scene.loose, planner, observation)
                 )
-                yield Judged(policy, number, verdict, evidence, cameras, action.reason)
+                judged.append(Judged(policy, number, verdict, evidence, cameras, action.reason))
+        yield judged
 
 
 def _scenes(first_seed: int) -> Iterator[DrawnScene]:
@@ -333,9 +356,3 @@ def _chosen(judged: list[Judged], confidences: list[float], threshold: float) ->
         if item.verdict != "stop":
             by_scene.setdefault(item.scene, []).append(k)
     return [surest(found, confidences.__getitem__, threshold) for found in by_scene.values()]
-
-
-def as_lines(judged: Iterable[Judged]) -> Iterator[str]:
-    """Yields decisions as lines of JSON."""
-    for item in judged:
-        yield json.dumps(item.__dict__)

@@ -1,19 +1,22 @@
-"""The table and diagram of `benchmark reliability`, made from random decisions."""
+"""`benchmark reliability`: how it resumes, and its table and diagram from random decisions."""
 
 import io
-import json
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import pytest
 from PIL import Image
 from rich.console import Console
 
+from kitting_drake.common.errors import UserError
 from kitting_drake.policies.confidence import read_reliability
+from kitting_drake.reproduction.benchmarks import reliability
 from kitting_drake.reproduction.benchmarks.reliability import (
     LEAST_CONFIDENCE,
     POLICIES,
     Judged,
-    as_lines,
+    measure_reliability,
     summarize_all,
 )
 from kitting_drake.reproduction.benchmarks.reliability_report import (
@@ -43,11 +46,6 @@ def drawn(policy: str, seed: int) -> list[Judged]:
 
 def test_a_fit_is_cross_validated_and_reported(tmp_path: Path):
     judged = [item for number, policy in enumerate(POLICIES) for item in drawn(policy, number)]
-    path = tmp_path / "decisions.jsonl"
-    path.write_text("".join(line + "\n" for line in as_lines(judged)))
-    lines = path.read_text().splitlines()
-    assert [Judged(**json.loads(line)) for line in lines] == judged
-
     measured = summarize_all(judged, None, tmp_path)
     for policy in POLICIES:
         found = measured[policy]
@@ -67,3 +65,38 @@ def test_a_fit_is_cross_validated_and_reported(tmp_path: Path):
     assert said.count("the generalist") == 4 and "default cameras" in said
     with Image.open(io.BytesIO(draw_reliability(measured))) as picture:
         assert picture.format == "PNG"
+
+
+def test_an_interrupted_run_is_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    by_scene: list[list[Judged]] = [[] for _ in range(300)]
+    for number, policy in enumerate(POLICIES):
+        for item in drawn(policy, number):
+            by_scene[item.scene].append(item)
+    judged_now: list[int] = []
+
+    def draw(seed: int, numbers: range, weights: Path | None = None) -> Iterator[list[Judged]]:
+        for number in numbers:
+            if len(judged_now) == 40:
+                raise KeyboardInterrupt
+            judged_now.append(number)
+            yield by_scene[number]
+
+    monkeypatch.setattr(reliability, "draw_judged", draw)
+    console = Console(file=io.StringIO())
+
+    def measure(seed: int, count: int, folder: Path) -> dict[str, object]:
+        folder.mkdir(exist_ok=True)
+        return measure_reliability(seed, count, None, folder, console, fits=False)
+
+    with pytest.raises(KeyboardInterrupt):
+        measure(7, 60, tmp_path / "cut")
+    judged_now[:] = []
+    resumed = measure(7, 60, tmp_path / "cut")
+    assert judged_now == list(range(40, 60))
+    with pytest.raises(UserError, match="seed is 8, but 7 in them"):
+        measure(8, 60, tmp_path / "cut")
+
+    judged_now[:] = []
+    measure(7, 30, tmp_path / "whole")
+    judged_now[:] = []
+    assert measure(7, 60, tmp_path / "whole") == resumed
