@@ -1,4 +1,5 @@
-"""The figures in README.md, docs/robustness.md and docs/results.md agree with the result files.
+"""The figures in README.md, docs/findings.md, docs/robustness.md and docs/results.md agree with the
+result files.
 
 They are recomputed here from the outcomes of the episodes, independently of the code that writes
 the pages.
@@ -142,8 +143,8 @@ def test_the_papers_experiments_in_the_readme(runs: dict[str, Summary], headline
         assert row[2:] == ["reward", found, paper]
 
 
-def test_the_sentences_of_the_readme(runs: dict[str, Summary], readme: str):
-    text = one_line(readme)
+def test_the_sentences_of_the_findings(runs: dict[str, Summary]):
+    text = one_line((TREE / "docs" / "findings.md").read_text())
     behind = {}
     for task in ("unseen", "seen"):
         rates = [
