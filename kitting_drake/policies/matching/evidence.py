@@ -42,13 +42,19 @@ _HOLE = 0.003
 _REGION_FACTS = (
     *("is_object", "object_seen", "depth", "hole", "size", "apart"),
     *("over_recess", "cost", "reverse", "agreement", "reverse_agreement", "spread", "rival"),
-    *("asymmetry", "offset", "too_high", "height_off", "held_outside", "recess_seen"),
+    *("asymmetry", "offset", "offset_off", "too_high", "height_off"),
+    *("held_outside", "recess_seen"),
 )
-"""All of these facts are zero if no object is under the pick. Those of the last two rows are also
-zero if no recess is under the place."""
+"""All of these facts are zero if no object is under the pick. Those of the last three rows are
+also zero if no recess is under the place."""
 _USUAL_TOO_HIGH = -0.0007
 """A cavity is as deep as its tool is high, if tools do not stand out of the kit. The measured
 heights of tool and recess then differ by this, in metres: the median of the right decisions."""
+_GROWTH = 1.12
+"""In o_t, objects look larger and recesses smaller than they are, together by up to about this many
+pixels. With a clearance, `FitQuality.offset` is smaller by the clearance."""
+_WIDEST_CLEARANCE = 4.0
+"""The largest clearance, in mm, at which a recess does not seem too large for its object."""
 _FAR = 20.0
 """Upper limit of the distance from other objects, in mm."""
 _MOST_OUTSIDE = 0.5
@@ -145,6 +151,7 @@ def _fit_facts(
         Registration(rotation, place - rotation_matrix(rotation) @ pick, 0.0),
     )
     too_high = region.height - recess.height
+    offset, without_clearance = 1e3 * quality.offset, 1e3 * resolution * _GROWTH
     outside = held_outside(region, recess, pick, rotation, place, resolution)
     return {
         "over_recess": 1.0,
@@ -155,7 +162,10 @@ def _fit_facts(
         "spread": 1e3 * resolution * min(quality.spread, 1.0),
         "rival": 1e3 * float(np.clip(quality.rival, -0.003, 0.006)),
         "asymmetry": 1e3 * min(quality.asymmetry, 0.006),
-        "offset": 1e3 * quality.offset,
+        "offset": offset,
+        "offset_off": max(
+            offset - without_clearance, without_clearance - _WIDEST_CLEARANCE - offset, 0.0
+        ),
         "too_high": 1e3 * float(np.clip(too_high, -0.03, 0.03)),
         "height_off": 1e3 * min(abs(too_high - _USUAL_TOO_HIGH), 0.008),
         "held_outside": min(at_pixel(outside, pick), _MOST_OUTSIDE),

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from scipy.optimize import minimize
 
+from kitting_drake.common.errors import UserError
 from kitting_drake.common.files import (
     append_line,
     claim_folder,
@@ -113,8 +114,11 @@ def measure_reliability(
         A summary of each policy's decisions, by the number of cameras.
 
     Raises:
-        UserError: the folder holds other files, or decisions of other scenes, networks or code.
+        UserError: there are too few scenes for a fit; or the folder holds other files, or decisions
+            of other scenes, networks or code.
     """
+    if fits and count < _FOLDS * _FOLD:
+        raise UserError(f"--fit needs at least {_FOLDS * _FOLD} scenes: give more --scenes")
     networks = None if weights is None else files_digest([weights])
     described = {"seed": first_seed, "networks": networks, "commit": commit()} | versions()
     claim_folder(folder, "decisions_of.json", described, of="seed, networks or version")

@@ -100,3 +100,8 @@ def test_an_interrupted_run_is_resumed(tmp_path: Path, monkeypatch: pytest.Monke
     measure(7, 30, tmp_path / "whole")
     judged_now[:] = []
     assert measure(7, 60, tmp_path / "whole") == resumed
+
+
+def test_too_few_scenes_for_a_fit_are_refused(tmp_path: Path):
+    with pytest.raises(UserError, match="at least 60 scenes"):
+        measure_reliability(7, 59, None, tmp_path, Console(file=io.StringIO()), fits=True)
