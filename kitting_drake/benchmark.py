@@ -176,6 +176,7 @@ def _reliability(arguments: argparse.Namespace, console: Console, folder: Path) 
     from kitting_drake.reproduction.benchmarks.reliability import measure_reliability
     from kitting_drake.reproduction.benchmarks.reliability_report import (
         draw_reliability,
+        limits_table,
         reliability_table,
     )
 
@@ -186,7 +187,7 @@ def _reliability(arguments: argparse.Namespace, console: Console, folder: Path) 
         )
         write_json(folder / "reliability.json", measured)
         write_atomically(folder / "reliability.png", draw_reliability(measured))
-    return [reliability_table(measured)]
+    return [reliability_table(measured), limits_table(measured)]
 
 
 def _trace(arguments: argparse.Namespace, console: Console, folder: Path) -> list[Table]:

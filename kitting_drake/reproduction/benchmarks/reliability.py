@@ -62,6 +62,8 @@ _WITHOUT_KIT = 0.1
 LEAST_CONFIDENCE = 0.9
 """The confidence below which a robot does not act. This threshold is not fitted: confidence is a
 probability of success, so the threshold follows from the cost of a wrong action."""
+OTHER_LIMITS = (0.8, 0.95)
+"""Other limits for which the errors are reported."""
 _FOLDS, _FOLD = 6, 10
 """The number of parts in the cross-validation, and the number of successive scenes that stay in one
 part."""
@@ -139,7 +141,8 @@ def measure_reliability(
 def summarize_all(
     judged: list[Judged], weights: Path | None, fitted: Path | None
 ) -> dict[str, Any]:
-    """Summarizes decisions by policy and number of cameras.
+    """Summarizes decisions by policy and number of cameras, and for all cameras by the least
+    confidence.
 
     Args:
         judged: all decisions.
@@ -157,6 +160,15 @@ def summarize_all(
             confidences = _cross_validated(chosen)
             found[policy] = fit(chosen)
         summaries[policy] = _by_cameras(chosen, confidences, found[policy].threshold)
+        summaries[policy]["limits"] = [
+            {
+                "least_confidence": limit,
+                "wrong_answers": summary.wrong_answers,
+                "refused": summary.refused,
+            }
+            for limit in sorted({found[policy].threshold, *OTHER_LIMITS})
+            for summary in [summarize(chosen, confidences, limit)]
+        ]
     if fitted is not None:
         write_json(fitted / "confidence.json", {k: asdict(item) for k, item in found.items()})
     return summaries

@@ -1,4 +1,4 @@
-"""Makes the table and the diagram of `benchmark reliability`."""
+"""Makes the tables and the diagram of `benchmark reliability`."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 _NAMES = {"networks": "the generalist", "shape_matching": "shape matching"}
+_OTHER_KEYS = {"threshold", "limits"}
+"""The keys of a policy's measures that are no number of cameras."""
 _COLOURS = {"networks": "#e4572e", "shape_matching": "#1b998b"}
 
 
@@ -28,7 +30,7 @@ def reliability_table(measured: dict[str, Any]) -> Table:
         table.add_column(heading, justify="right")
     for policy, name in _NAMES.items():
         for cameras, found in measured[policy].items():
-            if cameras == "threshold":
+            if cameras in _OTHER_KEYS:
                 continue
             table.add_row(
                 name,
@@ -36,6 +38,23 @@ def reliability_table(measured: dict[str, Any]) -> Table:
                 str(found["decisions"]),
                 f"{100 * found['right']:.1f} %",
                 f"{found['calibration_error']:.3f}",
+                f"{100 * found['wrong_answers']:.1f} %",
+                f"{100 * found['refused']:.1f} %",
+            )
+    return table
+
+
+def limits_table(measured: dict[str, Any]) -> Table:
+    """Makes a table with a row for each policy and least confidence."""
+    table = Table(title="least confidence to act", title_justify="left")
+    table.add_column("policy")
+    for heading in ("least confidence", "wrong, of those above", "below, of the right ones"):
+        table.add_column(heading, justify="right")
+    for policy, name in _NAMES.items():
+        for found in measured[policy]["limits"]:
+            table.add_row(
+                name,
+                f"{found['least_confidence']:g}",
                 f"{100 * found['wrong_answers']:.1f} %",
                 f"{100 * found['refused']:.1f} %",
             )

@@ -21,6 +21,7 @@ from kitting_drake.reproduction.benchmarks.reliability import (
 )
 from kitting_drake.reproduction.benchmarks.reliability_report import (
     draw_reliability,
+    limits_table,
     reliability_table,
 )
 
@@ -53,6 +54,10 @@ def test_a_fit_is_cross_validated_and_reported(tmp_path: Path):
         assert found["all"]["calibration_error"] < 0.1
         # The policy acts at a confidence of 0.9 or more, so under a tenth of its answers are wrong.
         assert found["all"]["wrong_answers"] < 0.1
+        # With a higher limit, more right decisions are refused.
+        limits = [(item["least_confidence"], item["refused"]) for item in found["limits"]]
+        assert limits == sorted(limits) and limits[0][1] < limits[-1][1]
+        assert (LEAST_CONFIDENCE, found["all"]["refused"]) in limits
     # Weights use the confidence file that has their name and is beside them.
     (tmp_path / "confidence.json").rename(tmp_path / "own.confidence.json")
     own = read_reliability("networks", tmp_path / "own.safetensors")
@@ -60,9 +65,9 @@ def test_a_fit_is_cross_validated_and_reported(tmp_path: Path):
     assert own.weights != read_reliability("networks").weights
 
     console = Console(file=io.StringIO(), width=140)
-    console.print(reliability_table(measured))
+    console.print(reliability_table(measured), limits_table(measured))
     said = console.file.getvalue()  # type: ignore[attr-defined]
-    assert said.count("the generalist") == 4 and "default cameras" in said
+    assert said.count("the generalist") == 7 and "default cameras" in said
     with Image.open(io.BytesIO(draw_reliability(measured))) as picture:
         assert picture.format == "PNG"
 
