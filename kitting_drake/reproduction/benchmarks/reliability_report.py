@@ -9,7 +9,10 @@ import matplotlib
 from matplotlib.figure import Figure
 from rich.table import Table
 
-_NAMES = {"networks": "the generalist", "shape_matching": "shape matching"}
+_NAMES = {"networks": "generalist", "shape_matching": "shape matching"}
+_ERRORS = ("wrong above", "right below")
+"""Headings: the wrong share of the decisions above the threshold, and the share of the right
+decisions that is below it."""
 _OTHER_KEYS = {"threshold", "limits"}
 """The keys of a policy's measures that are no number of cameras."""
 _COLOURS = {"networks": "#e4572e", "shape_matching": "#1b998b"}
@@ -20,13 +23,7 @@ def reliability_table(measured: dict[str, Any]) -> Table:
     table = Table(title="confidence of decisions", title_justify="left")
     for heading in ("policy", "cameras"):
         table.add_column(heading)
-    for heading in (
-        "decisions",
-        "right",
-        "error of the confidence",
-        "wrong, of those above the threshold",
-        "below the threshold, of the right ones",
-    ):
+    for heading in ("decisions", "right", "error", *_ERRORS):
         table.add_column(heading, justify="right")
     for policy, name in _NAMES.items():
         for cameras, found in measured[policy].items():
@@ -48,7 +45,7 @@ def limits_table(measured: dict[str, Any]) -> Table:
     """Makes a table with a row for each policy and least confidence."""
     table = Table(title="least confidence to act", title_justify="left")
     table.add_column("policy")
-    for heading in ("least confidence", "wrong, of those above", "below, of the right ones"):
+    for heading in ("least confidence", *_ERRORS):
         table.add_column(heading, justify="right")
     for policy, name in _NAMES.items():
         for found in measured[policy]["limits"]:

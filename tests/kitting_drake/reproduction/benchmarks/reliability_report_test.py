@@ -67,7 +67,7 @@ def test_a_fit_is_cross_validated_and_reported(tmp_path: Path):
     console = Console(file=io.StringIO(), width=140)
     console.print(reliability_table(measured), limits_table(measured))
     said = console.file.getvalue()  # type: ignore[attr-defined]
-    assert said.count("the generalist") == 7 and "default cameras" in said
+    assert said.count("generalist") == 7 and "default cameras" in said
     with Image.open(io.BytesIO(draw_reliability(measured))) as picture:
         assert picture.format == "PNG"
 
