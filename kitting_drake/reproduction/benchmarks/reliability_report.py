@@ -21,8 +21,8 @@ _COLOURS = {"networks": "#e4572e", "shape_matching": "#1b998b"}
 def reliability_table(measured: dict[str, Any]) -> Table:
     """Makes a table with a row for each policy and number of cameras."""
     table = Table(title="confidence of decisions", title_justify="left")
-    for heading in ("policy", "cameras"):
-        table.add_column(heading)
+    table.add_column("policy", min_width=10)
+    table.add_column("cameras")
     for heading in ("decisions", "right", "error", *_ERRORS):
         table.add_column(heading, justify="right")
     for policy, name in _NAMES.items():
