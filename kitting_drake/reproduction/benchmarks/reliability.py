@@ -101,7 +101,7 @@ def measure_reliability(
     fits: bool,
 ) -> dict[str, Any]:
     """Measures how reliable the confidence of decisions is. Scenes that are in the folder already
-    are skipped, so the same command resumes the work, and more `count` adds scenes.
+    are skipped, so the same command resumes the work, and a larger `count` adds scenes.
 
     Args:
         first_seed: the seed of the first scene.
