@@ -178,6 +178,8 @@ def test_the_sentences_of_the_findings(runs: dict[str, Summary]):
         f"place red in green ({red[0]} and {red[1]} %, at N = 36 and 180; "
         f"{longer[0]} and {longer[1]} % with three times the training steps)"
     ) in text
+    other = percent(runs, "place_red_in_green_equivariant_transporter_36_1")
+    assert f"the Equivariant Transporter is no better: {other} % at N = 36" in text
     pyramid, boxes = (
         [f"{100 * float(runs[f'{task}_so2_{n}_1']['success_rate']):.1f}" for n in orientations]
         for task, orientations in (("stack_block_pyramid", (36, 180)), ("palletizing_boxes", (36,)))
