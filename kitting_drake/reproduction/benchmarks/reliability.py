@@ -62,7 +62,7 @@ _WITHOUT_KIT = 0.1
 LEAST_CONFIDENCE = 0.9
 """The confidence below which a robot does not act. This threshold is not fitted: confidence is a
 probability of success, so the threshold follows from the cost of a wrong action."""
-OTHER_LIMITS = (0.8, 0.95)
+_OTHER_LIMITS = (0.8, 0.95)
 """Other limits for which the errors are reported."""
 _FOLDS, _FOLD = 6, 10
 """The number of parts in the cross-validation, and the number of successive scenes that stay in one
@@ -160,18 +160,21 @@ def summarize_all(
             confidences = _cross_validated(chosen)
             found[policy] = fit(chosen)
         summaries[policy] = _by_cameras(chosen, confidences, found[policy].threshold)
-        summaries[policy]["limits"] = [
-            {
-                "least_confidence": limit,
-                "wrong_answers": summary.wrong_answers,
-                "refused": summary.refused,
-            }
-            for limit in sorted({found[policy].threshold, *OTHER_LIMITS})
-            for summary in [summarize(chosen, confidences, limit)]
-        ]
+        limits = sorted({found[policy].threshold, *_OTHER_LIMITS})
+        summaries[policy]["limits"] = [_at(limit, chosen, confidences) for limit in limits]
     if fitted is not None:
         write_json(fitted / "confidence.json", {k: asdict(item) for k, item in found.items()})
     return summaries
+
+
+def _at(limit: float, judged: list[Judged], confidences: list[float]) -> dict[str, float]:
+    """Returns the errors of a policy that acts with at least the confidence `limit`."""
+    found = summarize(judged, confidences, limit)
+    return {
+        "least_confidence": limit,
+        "wrong_answers": found.wrong_answers,
+        "refused": found.refused,
+    }
 
 
 def _by_cameras(judged: list[Judged], confidences: list[float], threshold: float) -> dict[str, Any]:
