@@ -34,6 +34,8 @@ FILE = MODELS / "policies" / "confidence.json"
 """The file of the fitted regressions, one for each kind of policy."""
 MOST_PROPOSALS = 3
 """A policy that is not sure of an action proposes actions for at most this many objects."""
+CLEARLY_SURE = 0.98
+"""A policy that is at least this sure of an action proposes no other."""
 _SAME_PICK = 0.010
 """Pixels within this distance of the pick, in metres, count as the same pick."""
 _OTHER_PICKS = 0.060
@@ -61,24 +63,25 @@ class Reliability:
         return 1 / (1 + math.exp(-max(-30.0, min(total, 30.0))))
 
 
-def surest(items: Iterable[_Item], confidence: Callable[[_Item], float], least: float) -> _Item:
-    """Returns the first of several proposals whose confidence is at least `least`; if there is
-    none, the one with the highest confidence.
+def ranked(
+    items: Iterable[_Item], confidence: Callable[[_Item], float], least: float = 0.0
+) -> list[_Item]:
+    """Returns a policy's proposals for one observation, the surest first.
 
-    Only the first `MOST_PROPOSALS` are considered, and no proposal is made after the first sure
-    one.
+    Proposals are considered until one is clearly sure (`CLEARLY_SURE`), and at most
+    `MOST_PROPOSALS` of them.
 
     Args:
-        items: the proposals, in the order in which the policy prefers them; not empty.
+        items: the proposals, in the order in which the policy prefers them.
         confidence: the confidence of a proposal, from 0 to 1.
-        least: the least confidence with which the robot acts.
+        least: the least confidence with which the robot acts. No proposal below it is clearly sure.
     """
     seen: list[_Item] = []
     for item in islice(items, MOST_PROPOSALS):
         seen.append(item)
-        if confidence(item) >= least:
+        if confidence(item) >= max(CLEARLY_SURE, least):
             break
-    return max(seen, key=confidence)
+    return sorted(seen, key=confidence, reverse=True)
 
 
 def read_reliability(policy: str, weights: Path | None = None) -> Reliability:

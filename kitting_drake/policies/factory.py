@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,10 +10,10 @@ from typing import TYPE_CHECKING
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.paths import GENERALIST
 from systems.pick_place_parameters import PickPlaceParameters
-from systems.signals import Observation, PixelGrid
+from systems.signals import PixelGrid
 
 if TYPE_CHECKING:
-    from kitting_drake.policies.learned_policy import Decision, LearnedPolicy
+    from kitting_drake.policies.learned_policy import LearnedPolicy
     from kitting_drake.policies.matching.shape_matching import ShapeMatchingPolicy
 
 
@@ -73,7 +72,6 @@ def load_learned_policy(
     fit_outlines: bool = True,
     recover: bool = False,
     may_stop: bool = True,
-    watch: Callable[[Observation, Decision], None] | None = None,
 ) -> LoadedPolicy:
     """Loads a policy with trained networks.
 
@@ -87,7 +85,6 @@ def load_learned_policy(
         fit_outlines: whether to refine actions by the geometry of o_t as well.
         recover: whether to correct failed insertions, take heaps apart and turn objects over.
         may_stop: whether the policy may stop when there is nothing left to pick.
-        watch: if given, a function that is called with each observation and decision.
 
     Raises:
         UserError: the file is unusable, or the networks do not support N orientations.
@@ -115,7 +112,6 @@ def load_learned_policy(
             orientations=orientations,
             stages=stages,
             resolution=resolution,
-            watch=watch,
         )
     except ValueError as error:
         raise UserError(f"{orientations_field}: {error}") from error

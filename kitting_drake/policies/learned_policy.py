@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -91,7 +91,6 @@ class LearnedPolicy:
         orientations: int = 180,
         stages: Sequence[Stage] = DEFAULT_STAGES,
         resolution: float | None = None,
-        watch: Callable[[Observation, Decision], None] | None = None,
     ) -> None:
         """
         Args:
@@ -101,7 +100,6 @@ class LearnedPolicy:
             stages: the stages, in the order in which they are applied (see `make_stages`). Without
                 stages this is the paper's policy, whose actions are quantized to pixels and bins.
             resolution: the side of a pixel in training, in metres; None if unknown.
-            watch: if given, a function that is called with each observation and decision.
 
         Raises:
             ValueError: the networks do not support N orientations.
@@ -111,7 +109,6 @@ class LearnedPolicy:
         self._orientations = orientations
         self._stages = tuple(stages)
         self._resolution = resolution
-        self._watch = watch
 
     def __call__(
         self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()
@@ -170,8 +167,6 @@ class LearnedPolicy:
         if draft.mending is not None:
             return draft.look.inventory.named(draft.mending), None
         decision = _decision(draft)
-        if self._watch is not None:
-            self._watch(draft.look.observation, decision)
         if decision.stop:
             action = decision.action
             stop = PickPlaceAction(stop=True, reason=action.reason, left_over=action.left_over)

@@ -15,13 +15,14 @@ while True:
         failed.append(decision.action.pick)
 """
 
+from kitting_drake.policies.choices import Choice
 from kitting_drake.real_camera.calibrations.calibration import (
     BenchCamera,
     Calibration,
     read_calibration,
     write_calibration,
 )
-from kitting_drake.real_camera.deciders import BenchPolicy, Choice, load_policy
+from kitting_drake.real_camera.deciders import BenchPolicy, load_policy
 from kitting_drake.real_camera.deciders import ShapeMatchingDecider as ShapeMatching
 from kitting_drake.real_camera.decision import BenchDecision, decide
 from kitting_drake.real_camera.frames import Frame, read_frames

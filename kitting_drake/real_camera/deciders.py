@@ -1,61 +1,21 @@
-"""The policies for real cameras. Each yields actions, with a confidence and a picture."""
+"""The policies for real cameras. Each yields actions with a confidence."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
-from functools import partial
-from itertools import chain, islice, takewhile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
-from kitting_drake.policies.confidence import (
-    MOST_PROPOSALS,
-    certainty,
-    evidence_of_networks,
-    read_reliability,
-    surest,
-)
+from kitting_drake.policies.choices import Choice, choose_by_networks, choose_by_shape
+from kitting_drake.policies.confidence import read_reliability
 from kitting_drake.policies.factory import (
     LoadedPolicy,
     load_learned_policy,
     make_shape_matching,
 )
-from kitting_drake.policies.matching.shape_matching import Matched
 from systems.pick_place_parameters import PickPlaceParameters
-from systems.signals import Observation, PickPlaceAction, PixelGrid, PlanarPose
-
-if TYPE_CHECKING:
-    from kitting_drake.policies.learned_policy import Decision
-
-Draw = Callable[[str], bytes]
-"""A function that draws a decision as a PNG, with a given title."""
-
-
-def _draw_nothing(title: str) -> bytes:
-    return b""
-
-
-@dataclass(frozen=True)
-class Choice:
-    """A policy's choice: an action with its confidence."""
-
-    action: PickPlaceAction
-    confidence: float | None
-    """The confidence from 0 to 1; None if the policy estimates none for this action."""
-    parts: dict[str, float] = field(default_factory=dict)
-    """The networks' certainty of each part of the decision, from 0 to 1; see `certainty`."""
-    draw: Draw = _draw_nothing
-    """Draws the decision as a PNG with a given title; an empty title selects the default one."""
-    reason: str = ""
-    """A sentence that says why the policy acts or stops; empty if `action.reason` says it."""
-
-    @classmethod
-    def stopped(cls, observation: Observation) -> Choice:
-        """Makes the choice to stop, for observations on which no policy decides."""
-        action = PickPlaceAction(stop=True)
-        return cls(action, None, draw=partial(_draw_action, observation, action))
+from systems.signals import Observation, PixelGrid, PlanarPose
 
 
 class BenchPolicy(Protocol):
@@ -110,16 +70,7 @@ class ShapeMatchingDecider:
         self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()
     ) -> Iterator[Choice]:
         policy = make_shape_matching(self.parameters, recover=self.recover)
-        reliability = read_reliability("shape_matching")
-        least = reliability.threshold if self.least_confidence is None else self.least_confidence
-
-        def choice(matched: Matched) -> Choice:
-            facts = matched.geometry
-            confidence = None if facts is None else reliability.confidence(facts)
-            draw = partial(_draw_action, observation, matched.action)
-            return Choice(matched.action, confidence, draw=draw)
-
-        return _sure_choices(map(choice, policy.proposals(observation, failed_picks)), least)
+        return choose_by_shape(policy, self.least_confidence)(observation, failed_picks)
 
 
 @dataclass(frozen=True)
@@ -140,63 +91,7 @@ class _Networks:
     def choices(
         self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()
     ) -> Iterator[Choice]:
-        proposals = self.loaded.function.proposals(observation, failed_picks)
-        return _sure_choices((self._choice(observation, *item) for item in proposals), self.least)
-
-    def _choice(
-        self, observation: Observation, action: PickPlaceAction, decision: Decision | None
-    ) -> Choice:
-        if decision is None:
-            return Choice(action, None, draw=partial(_draw_action, observation, action))
-        parts = certainty(decision, observation.grid.resolution)
-
-        def draw(title: str) -> bytes:
-            # Import matplotlib lazily.
-            from kitting_drake.evaluation.decision_figure import draw_decision
-
-            return draw_decision(observation, decision, title=title)
-
-        if decision.kit_seen is False:
-            stop = PickPlaceAction(stop=True, reason="no kit seen")
-            return Choice(stop, None, parts, draw)
-        if action.stop:
-            return Choice(action, parts.get("nothing_to_pick"), parts, draw)
-        if decision.kit_seen is None:
-            # The fitted confidence holds only for decisions that use outlines. For other decisions
-            # use the networks' own certainty.
-            return Choice(action, math.prod(parts.values()), parts, draw)
-        evidence = evidence_of_networks(observation, decision)
-        confidence = read_reliability("networks", self.loaded.path).confidence(evidence)
-        return Choice(action, confidence, parts, draw)
-
-
-def _sure_choices(choices: Iterator[Choice], least: float) -> Iterator[Choice]:
-    """Yields the first choice if it is a stop or has no confidence; else the actions whose
-    confidence is at least `least`, or a stop if there are none."""
-
-    def is_estimated(choice: Choice) -> bool:
-        return choice.confidence is not None and not choice.action.stop
-
-    def confidence(choice: Choice) -> float:
-        return choice.confidence or 0.0
-
-    first = next(choices)
-    if not is_estimated(first):
-        yield first
-        return
-    proposals = islice(chain([first], takewhile(is_estimated, choices)), MOST_PROPOSALS)
-    best = surest(proposals, confidence, least)
-    if confidence(best) < least:
-        said = (
-            f"the best action succeeds with probability {best.confidence:.2f}, "
-            f"less than {least:.2f}"
-        )
-        yield replace(best, action=PickPlaceAction(stop=True, reason="not sure"), reason=said)
-        return
-    for choice in chain([best], proposals):
-        if confidence(choice) >= least:
-            said = f"the probability of success is {choice.confidence:.2f}"
-            yield replace(choice, reason=said)
+        return choose_by_networks(self.loaded, self.least)(observation, failed_picks)
 
 
 def load_policy(
@@ -239,9 +134,3 @@ def load_policy(
     elif fit_outlines:
         least = read_reliability("networks", loaded.path).threshold
     return _Networks(loaded, least)
-
-
-def _draw_action(observation: Observation, action: PickPlaceAction, title: str) -> bytes:
-    from kitting_drake.evaluation.decision_figure import draw_action
-
-    return draw_action(observation, action, title=title)

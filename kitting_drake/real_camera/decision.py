@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
+from kitting_drake.policies.choices import Choice
 from kitting_drake.real_camera.calibrations.calibration import Calibration
 from kitting_drake.real_camera.checking.table_check import check_table
 from kitting_drake.real_camera.checking.views import (
@@ -15,7 +16,7 @@ from kitting_drake.real_camera.checking.views import (
     observe,
     seen_share,
 )
-from kitting_drake.real_camera.deciders import BenchPolicy, Choice
+from kitting_drake.real_camera.deciders import BenchPolicy
 from kitting_drake.real_camera.frames import Frame
 from kitting_drake.real_camera.robots.bench_robot import BenchRobot
 from systems.arm_trajectory import ArmTrajectory
@@ -123,7 +124,14 @@ class BenchDecision:
 
     def draw(self) -> bytes:
         """Draws the decision as a PNG."""
-        return self.choice.draw(f"{self.result}: {self.reason}" if self.reason else self.result)
+        # Import matplotlib lazily.
+        from kitting_drake.evaluation.decision_figure import draw_action, draw_decision
+
+        title = f"{self.result}: {self.reason}" if self.reason else self.result
+        if self.choice.decision is not None:
+            return draw_decision(self.observation, self.choice.decision, title=title)
+        action = self.choice.refused or self.choice.action
+        return draw_action(self.observation, action, title=title)
 
 
 def decide(
@@ -188,8 +196,8 @@ def decide(
         out_of_reach = out_of_reach or (choice, trajectory)
     assert out_of_reach is not None  # A policy makes at least one choice.
     choice, said = out_of_reach
-    choice = replace(choice, action=PickPlaceAction(stop=True, reason="not sure"))
-    return _stopped("not sure", said, observation, seen, parameters, choice, warnings)
+    stopped = choice.stopped(said)
+    return _stopped("not sure", said, observation, seen, parameters, stopped, warnings)
 
 
 def _refused(
@@ -222,7 +230,7 @@ def _stopped(
     surfaces = SurfaceHeights()
     heights = motion_heights(surfaces, parameters)
     if choice is None:
-        choice = Choice.stopped(observation)
+        choice = Choice(PickPlaceAction(stop=True), None)
     return BenchDecision(
         result, reason, observation, seen, choice, surfaces, heights, parameters, list(warnings)
     )

@@ -15,6 +15,7 @@ from pydrake.systems.framework import LeafSystem
 from kitting_drake.common.errors import UserError
 from kitting_drake.common.own_modules import files_beside, import_own, own_digest
 from kitting_drake.common.paths import GENERALIST
+from kitting_drake.policies.choices import Choose, choose_by_networks, choose_by_shape
 from kitting_drake.policies.factory import load_learned_policy, make_shape_matching
 from kitting_drake.tasks.task import Scene
 from systems.action_quantizer import ActionQuantizer
@@ -199,6 +200,11 @@ class Learned(PolicyConfig):
     # object is taken out twice. Recovery needs extra actions: see the task's `tries`.
     recover: bool = False
 
+    # The least probability of success with which the policy acts. Below it, the policy stops with
+    # the reason `not sure`, as `decide` does below 0.9. At 0 it always acts. Only decisions that
+    # use outlines have such a probability (see `fit_outlines`).
+    least_confidence: float = bounded(0.0, 0.0, 1.0)
+
     def make_system(self, site: PolicySite) -> LeafSystem:
         # Outlines and recesses matter only if objects are inserted into cavities.
         insertion = any(goal.rim_height is not None for goal in site.scene.goals)
@@ -214,7 +220,6 @@ class Learned(PolicyConfig):
             fit_outlines=self.fit_outlines,
             recover=self.recover,
             may_stop=site.may_stop,
-            watch=site.observer,
         )
         loaded.check_grid(site.grid, "heightmap.resolution")
         if site.grid.z_min != 0:
@@ -224,7 +229,7 @@ class Learned(PolicyConfig):
             )
         # An observer gets colours even if the networks use only heights.
         heights_only = not loaded.colour and site.observer is None
-        function = loaded.function
+        function = _FirstChoice(choose_by_networks(loaded, self.least_confidence), site.observer)
         return PickPlacePolicy(
             policy=function
             if self.avoid_failed_picks
@@ -245,6 +250,7 @@ class Learned(PolicyConfig):
             "fit_outlines": self.continuous and self.fit_outlines,
             "recover": self.recover,
             "avoid_failed_picks": self.avoid_failed_picks,
+            "least_confidence": self.least_confidence,
             "trained_orientations": file.config.orientations,
             "compute_type": str(preferred_type()).removeprefix("torch."),
             **{key: file.card.get(key) for key in _TOLD},
@@ -268,6 +274,10 @@ class Learned(PolicyConfig):
     def validate(self) -> None:
         if self.recover and not self.avoid_failed_picks:
             raise ValueError("policy.recover needs policy.avoid_failed_picks: true")
+        if self.least_confidence and not (self.continuous and self.fit_outlines):
+            raise ValueError(
+                "policy.least_confidence needs policy.continuous and policy.fit_outlines: true"
+            )
 
     def _path(self, base: Path) -> Path:
         return base / self.weights if self.weights else GENERALIST
@@ -283,12 +293,20 @@ class ShapeMatching(PolicyConfig):
     # Whether to recover from failed insertions, as for !Learned.
     recover: bool = False
 
+    # The least probability of success with which the policy acts, as for !Learned.
+    least_confidence: float = bounded(0.0, 0.0, 1.0)
+
     def make_system(self, site: PolicySite) -> LeafSystem:
-        function = make_shape_matching(site.planner, recover=self.recover)
+        policy = make_shape_matching(site.planner, recover=self.recover)
+        function = _FirstChoice(choose_by_shape(policy, self.least_confidence))
         return PickPlacePolicy(policy=function, heights_only=True)
 
     def details(self, base: Path) -> dict[str, Any]:
-        return {"method": "shape_matching", "recover": self.recover}
+        return {
+            "method": "shape_matching",
+            "recover": self.recover,
+            "least_confidence": self.least_confidence,
+        }
 
 
 @dataclass
@@ -359,6 +377,22 @@ class _OfObservationAlone:
 
     def __repr__(self) -> str:
         return repr(self.function)
+
+
+@dataclass(frozen=True)
+class _FirstChoice:
+    """Acts by the first choice, and reports the networks' decision that led to it."""
+
+    choose: Choose
+    observer: DecisionObserver | None = None
+
+    def __call__(
+        self, observation: Observation, failed_picks: Sequence[PlanarPose] = ()
+    ) -> PickPlaceAction:
+        choice = next(self.choose(observation, failed_picks))
+        if self.observer is not None and choice.decision is not None:
+            self.observer(observation, choice.decision)
+        return choice.action
 
 
 Policy = Oracle | QuantizedOracle | Learned | ShapeMatching | PythonPolicy

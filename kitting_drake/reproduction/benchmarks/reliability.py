@@ -31,8 +31,8 @@ from kitting_drake.policies.confidence import (
     MOST_PROPOSALS,
     Reliability,
     evidence_of_networks,
+    ranked,
     read_reliability,
-    surest,
 )
 from kitting_drake.policies.factory import load_learned_policy, make_shape_matching
 from kitting_drake.policies.matching.evidence import Evidence
@@ -335,8 +335,8 @@ class ReliabilitySummary:
 def summarize(
     judged: list[Judged], confidences: list[float], threshold: float
 ) -> ReliabilitySummary:
-    """Summarizes the decisions of one policy. Of the proposals in a scene, only the `surest` one
-    counts.
+    """Summarizes the decisions of one policy. Of the proposals in a scene, only the surest one
+    counts (`ranked`).
 
     Args:
         judged: the proposals.
@@ -374,4 +374,4 @@ def _chosen(judged: list[Judged], confidences: list[float], threshold: float) ->
     for k, item in enumerate(judged):
         if item.verdict != "stop":
             by_scene.setdefault(item.scene, []).append(k)
-    return [surest(found, confidences.__getitem__, threshold) for found in by_scene.values()]
+    return [ranked(found, confidences.__getitem__, threshold)[0] for found in by_scene.values()]

@@ -315,12 +315,11 @@ class Cell:
         if list(summary["seeds"]) != list(self.seeds):
             return f"its seeds are not {self.seeds[0]} to {self.seeds[-1]}"
         if isinstance(self.policy, str):
-            # Runs that lack the field avoid_failed_picks did avoid failed picks. Ignore the names
+            # Runs that lack these fields did avoid failed picks, and always acted. Ignore the names
             # of weights, because weights are compared by their digest.
+            earlier = {"avoid_failed_picks": True, "least_confidence": 0.0}
             policies = (summary["resolved_scenario"]["policy"], expected["policy"])
-            found, wanted = (
-                {"avoid_failed_picks": True} | policy | {"weights": ""} for policy in policies
-            )
+            found, wanted = (earlier | policy | {"weights": ""} for policy in policies)
             if found != wanted:
                 return f"its policy is not {self.policy}"
             same = summary["policy_digest"] == _loaded(self).policy.digest(SCENARIOS / "paper")
@@ -328,8 +327,8 @@ class Cell:
         details = self._details(self.policy)
         # Runs that lack the field avoid_failed_picks did avoid failed picks. Accept these runs: the
         # page of results says how many actions this can have changed.
-        earlier = {"angle_only": False, "avoid_failed_picks": self.avoid_failed_picks}
-        found = earlier | {"rotations": None} | summary["policy_details"]
+        lacking = {"angle_only": False, "avoid_failed_picks": self.avoid_failed_picks}
+        found = lacking | {"rotations": None} | summary["policy_details"]
         key = rates_key(reference(self.policy))
         if rates and "learning_rate" not in details and key in rates:
             details["learning_rate"] = float(best_rate(rates[key]))

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kitting_drake.policies.confidence import FILE, read_reliability, surest
+from kitting_drake.policies.confidence import FILE, ranked, read_reliability
 from kitting_drake.policies.matching.shape_matching import ShapeMatchingPolicy
 from kitting_drake.reproduction.benchmarks.reliability import (
     LEAST_CONFIDENCE,
@@ -47,16 +47,17 @@ def test_the_fit_finds_the_law_and_is_calibrated():
 
 
 @pytest.mark.parametrize(
-    ("confidences", "asked", "chosen"),
+    ("confidences", "least", "asked"),
     [
-        ([0.95, 0.99], 1, 0.95),
-        ([0.4, 0.92, 0.99], 2, 0.92),
-        ([0.4, 0.8, 0.6, 0.99], 3, 0.8),
-        ([0.3], 1, 0.3),
+        ([0.99, 0.999], 0.9, 1),
+        ([0.4, 0.985, 0.99], 0.9, 2),
+        ([0.92, 0.97, 0.4, 0.99], 0.9, 3),
+        ([0.985, 0.4, 0.995], 0.99, 3),
+        ([0.3], 0.9, 1),
     ],
 )
-def test_the_first_sure_proposal_is_chosen(confidences: list[float], asked: int, chosen: float):
-    """If none is sure, the surest is. A proposal takes time, so no more are made than needed."""
+def test_the_surest_proposal_comes_first(confidences: list[float], least: float, asked: int):
+    """A proposal takes time, so none is made after one that is clearly sure."""
     made = []
 
     def propose() -> Iterator[float]:
@@ -64,8 +65,9 @@ def test_the_first_sure_proposal_is_chosen(confidences: list[float], asked: int,
             made.append(confidence)
             yield confidence
 
-    assert surest(propose(), lambda confidence: confidence, 0.9) == chosen
+    found = ranked(propose(), lambda confidence: confidence, least)
     assert len(made) == asked
+    assert found == sorted(made, reverse=True)
 
 
 def test_the_proposal_that_is_chosen_counts():

@@ -272,18 +272,6 @@ def test_unsupported_orientations_are_rejected(orientations: int, message: str):
         LearnedPolicy(Known(), orientations=orientations)
 
 
-def test_every_decision_is_reported_to_watch():
-    told: list[tuple[Observation, Decision]] = []
-    policy = LearnedPolicy(
-        Known(), orientations=N, watch=lambda seen, decision: told.append((seen, decision))
-    )
-    seen = observation()
-    action = policy(seen)
-    ((observed, decision),) = told
-    assert observed is seen
-    assert decision.action is action
-
-
 def test_avoids_failed_grasps():
     networks = Known()
     policy = LearnedPolicy(networks, orientations=N, stages=())

@@ -14,6 +14,7 @@ from safetensors.torch import save_file
 from kitting_drake.common.errors import UserError
 from kitting_drake.policies.draft import Stage
 from kitting_drake.policies.learned_policy import Decision, LearnedPolicy
+from kitting_drake.policies.matching.shape_matching import Matched, ShapeMatchingPolicy
 from kitting_drake.policies.networks.device import preferred_type
 from kitting_drake.policies.networks.weights import load_networks
 from kitting_drake.policies.stages import StopRule, make_stages
@@ -114,6 +115,7 @@ def test_details_and_digests_for_results(weights_file: Path):
         "fit_outlines": False,
         "recover": False,
         "avoid_failed_picks": True,
+        "least_confidence": 0.0,
         "trained_orientations": 72,
         "compute_type": str(preferred_type()).removeprefix("torch."),
         "scenario": "mine",
@@ -230,6 +232,23 @@ def test_the_policy_uses_the_scenarios_planner(
     monkeypatch.setattr("kitting_drake.policies.stages.make_stages", noted)
     Learned(str(weights_file)).make_system(dataclasses.replace(site, planner=deep))
     assert given == [deep]
+
+
+def test_acts_on_the_surest_object_or_stops(site: PolicySite, monkeypatch: pytest.MonkeyPatch):
+    seen = stored_observation("kitting_unseen")
+    site = dataclasses.replace(site, grid=seen.grid)
+    proposed = list(ShapeMatchingPolicy(site.planner).proposals(seen))
+    assert len(proposed) == 4
+    poor = {"fit": 2.0, "cost": 5.0, "reverse": 5.0}
+    for k, item in enumerate(proposed[:2]):
+        proposed[k] = Matched(item.action, (item.geometry or {}) | poor)
+    monkeypatch.setattr(ShapeMatchingPolicy, "proposals", lambda *arguments: iter(proposed))
+    assert action(ShapeMatching(), site, seen) == proposed[2].action
+    assert action(ShapeMatching(least_confidence=0.9), site, seen) == proposed[2].action
+    refusal = PickPlaceAction(stop=True, reason="not sure")
+    assert action(ShapeMatching(least_confidence=1.0), site, seen) == refusal
+    with pytest.raises(ValueError, match=r"policy\.least_confidence needs"):
+        Learned(fit_outlines=False, least_confidence=0.9).validate()
 
 
 @pytest.mark.parametrize("avoids", [True, False])

@@ -27,6 +27,7 @@ from kitting_drake.policies.matching.regions.fixtures import (
     find_fixtures,
     fit_table,
 )
+from kitting_drake.policies.matching.regions.lone_pixels import without_lone_pixels
 from kitting_drake.policies.matching.regions.visibility import Visibility
 from systems.signals import Observation
 from systems.table_plane import plane_heights
@@ -222,7 +223,7 @@ def segment(observation: Observation) -> Segmentation:
         kits count as one fixture.
     """
     resolution = observation.grid.resolution
-    height = observation.outline_height
+    height = without_lone_pixels(observation.outline_height)
     table = fit_table(height)
     relief = (height - plane_heights(table, height.shape)).astype(np.float32)
     fixtures = find_fixtures(height, relief, resolution)
