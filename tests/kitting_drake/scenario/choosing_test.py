@@ -41,6 +41,7 @@ def test_described_holds_every_field(tmp_path: Path):
         "fit_outlines": True,
         "recover": False,
         "avoid_failed_picks": True,
+        "least_confidence": 0.0,
     }
     task = described["task"]
     assert (task["_tag"], task["split"], task["spacing"]) == ("!ToolsetKitting", "train", 0.008)
