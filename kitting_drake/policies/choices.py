@@ -95,10 +95,12 @@ def _of_networks(
     if decision is None:
         return Choice(action, None)
     parts = certainty(decision, observation.grid.resolution)
+    # A kit shows no cavity if earlier actions filled it. Only then is the reason one of these.
+    is_filled = action.reason in ("done", "gave up")
+    if decision.kit_seen is False and not is_filled:
+        return Choice(PickPlaceAction(stop=True, reason="no kit seen"), None, parts, decision)
     if action.stop:
         return Choice(action, parts.get("nothing_to_pick"), parts, decision)
-    if decision.kit_seen is False:
-        return Choice(PickPlaceAction(stop=True, reason="no kit seen"), None, parts, decision)
     if decision.kit_seen is None:
         # The fitted confidence holds only for decisions that use outlines. For other decisions use
         # the networks' own certainty.

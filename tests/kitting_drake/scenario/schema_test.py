@@ -23,7 +23,11 @@ ONE_OF_EVERYTHING = [
 
 
 SETTLED = {"start", "tray", "faces"}
-APART = {Learned: {"avoid_failed_picks", "least_confidence"}, Kitting: SETTLED, ToolsetKitting: SETTLED}
+APART = {
+    Learned: {"avoid_failed_picks", "least_confidence"},
+    Kitting: SETTLED,
+    ToolsetKitting: SETTLED,
+}
 """By class, the fields that `OneOfEverything` cannot give, because they exclude other fields.
 `policies_test` and `starts_test` cover them."""
 
