@@ -165,11 +165,14 @@ def test_the_sentences_of_the_findings(runs: dict[str, Summary]):
         for method in ("so2", "equivariant_transporter")
     )
     assert f"training seed changes a method's success by up to {spread:.1f} points" in text
-    plain, extended = (
-        100 * np.mean([item["success_rate"] for item in runs[name]["outcomes"]])
-        for name in ("stack_block_pyramid_so2_36_100", "stack_block_pyramid_so2_36_100_ours")
-    )
-    assert f"reaches {plain:.1f} % here. The same weights reach {extended:.1f} % with our" in text
+    cells = [f"stack_block_pyramid_so2_{name}" for name in ("36_10", "36_100", "180_100")]
+    plain = [f"{100 * runs[name]['success_rate']:.1f}" for name in cells]
+    extended = [f"{100 * runs[name + '_ours']['success_rate']:.1f}" for name in cells]
+    assert (
+        f"reaches {plain[0]} % after 10 demonstrations at N = 36, and {plain[1]} and {plain[2]} % "
+        "after 100 at N = 36 and 180."
+    ) in text
+    assert f"it reaches {extended[0]}, {extended[1]} and {extended[2]} %." in text
     red, longer = (
         [percent(runs, f"place_red_in_green_so2_{n}_1{steps}") for n in (36, 180)]
         for steps in ("", "_3_times_the_steps")
