@@ -36,6 +36,9 @@ metres, and by more than `_NOISE` standard deviations of the noise."""
 _FILLED = 0.002
 """A recess is empty if its floor is seen where it was, to within this, in metres, or to within
 `_NOISE` standard deviations of the noise."""
+_STANDS_OUT, _WHOLE = 0.005, 0.8
+"""A recess is no empty one if its object is higher than it is deep by more than `_STANDS_OUT`, in
+metres, and its pixels have less than the share `_WHOLE` of the variance of the object's pixels."""
 _AS_LARGE, _AS_WIDE = 0.45, 0.7
 """The pixels of an empty recess have at least the share `_AS_LARGE` of the variance of its object's
 pixels. Its inner radius is at least `_AS_WIDE` standard deviations of them across the object."""
@@ -100,7 +103,9 @@ class Memory:
         large as the action's object.
 
         The hole of a placed ring and the gap around a placed object are as deep, but smaller or
-        narrower.
+        narrower. If no camera sees the floor, the lowest point that is seen is on a wall, and a
+        hammer's handle may lie at its height. Then the head is missing from the recess, and the
+        hammer is higher than the recess is deep.
         """
         action, resolution = attempt.action, self.observation.grid.resolution
         recess = self.recess_at(action.place)
@@ -108,9 +113,11 @@ class Memory:
             return False
         xx, xy, yy = action.spread
         narrow = np.linalg.eigvalsh([[xx, xy], [xy, yy]])[0]
-        if recess.pixels.var(axis=0).sum() * resolution**2 < _AS_LARGE * (
-            xx + yy
-        ) or recess.inner_radius * resolution < _AS_WIDE * math.sqrt(narrow):
+        share = recess.pixels.var(axis=0).sum() * resolution**2 / (xx + yy)
+        if share < _AS_LARGE or recess.inner_radius * resolution < _AS_WIDE * math.sqrt(narrow):
+            return False
+        higher = 0.0 if attempt.top is None else attempt.top - attempt.floor - recess.height
+        if higher > _STANDS_OUT and share < _WHOLE:
             return False
         doubt = max(_FILLED, _NOISE * self.segmentation.noise)
         if attempt.top is not None:

@@ -466,6 +466,22 @@ def test_the_hole_of_a_placed_ring_is_no_empty_recess():
         assert Inventory.of(Observation(image, GRID, history=history)).why_stop == reason
 
 
+def test_the_handle_of_a_placed_hammer_is_no_floor():
+    """Before, only a wall of its recess was seen, which ended where the handle lies now."""
+    image = np.full((4, *GRID.shape), 0.5, np.float32)
+    image[3] = 0
+    image[3, 20:110, 20:140] = 0.049
+    image[3, 60:72, 50:100] = 0.039
+    xy = GRID.to_world((65.5, 74.5)).tolist()
+    long, narrow = (size**2 / 12 * GRID.resolution**2 for size in (62, 16))
+    action = PickPlaceAction(
+        PlanarPose(), PlanarPose(*xy), middle=(0.0, 0.0), spread=(narrow, 0.0, long)
+    )
+    for height, reason in ((0.022, "done"), (0.010, "gave up")):
+        history = (Attempt(action, "placed", top=0.039 + height, floor=0.039),)
+        assert Inventory.of(Observation(image, GRID, history=history)).why_stop == reason
+
+
 def test_an_object_that_was_dropped_out_of_sight_is_missing():
     dropped = dataclasses.replace(placed_by_policy(scene((bar(60, 180), 0.015))), outcome="dropped")
     empty = scene()
