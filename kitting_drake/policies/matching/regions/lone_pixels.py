@@ -27,6 +27,8 @@ def without_lone_pixels(height: NDArray[np.float32]) -> NDArray[np.float32]:
         if (row, col) != (1, 1):
             alike += np.abs(padded[row : row + rows, col : col + cols] - height) < _ALIKE
     lone = alike < _LEAST_ALIKE
+    if not lone.any():
+        return height
     cleaned = height.copy()
     cleaned[lone] = np.median(sliding_window_view(padded, (3, 3))[lone], axis=(1, 2))
     return cleaned
