@@ -98,7 +98,8 @@ def _of_networks(
     # A kit shows no cavity if earlier actions filled it. Only then is the reason one of these.
     is_filled = action.reason in ("done", "gave up")
     if decision.kit_seen is False and not is_filled:
-        return Choice(PickPlaceAction(stop=True, reason="no kit seen"), None, parts, decision)
+        stop = PickPlaceAction(stop=True, reason="no kit seen", left_over=action.left_over)
+        return Choice(stop, None, parts, decision)
     if action.stop:
         return Choice(action, parts.get("nothing_to_pick"), parts, decision)
     if decision.kit_seen is None:
