@@ -17,6 +17,7 @@ from PIL import Image
 
 from kitting_drake import decide as decide_command
 from kitting_drake.common.errors import UserError
+from kitting_drake.policies.choices import choose_by_networks
 from kitting_drake.policies.factory import load_learned_policy
 from kitting_drake.policies.matching.inventory import Inventory
 from kitting_drake.policies.matching.recovery import recovery_action
@@ -81,11 +82,12 @@ def check_against_cell(seed: int, folder: Path, orientations: int = 180) -> None
     np.testing.assert_array_equal(decision.observation.valid, found.observation.valid)
     assert decision.action == found.action
     assert 0 <= decision.choice.confidence <= 1
-    # With depth rounded to millimetres, the policy may be surer of another tool.
+    # With depth rounded to millimetres, the policy may be surer of another tool. The clearance is
+    # 2 mm.
     stepped = read_frames([write_frames(folder / "png", found.frames, "png")], calibration)
     other = decide(stepped, calibration, policy).action
     _, true = true_action(found, other)
-    assert (difference(other, true) < (1e-6, 1.0, 0.7)).all()
+    assert (difference(other, true) < (1e-6, 1.5, 0.7)).all()
 
 
 @pytest.fixture(scope="module")
@@ -117,9 +119,9 @@ def test_recovers_when_the_cell_does(high: float, scene: Rendered):
     assert recovery_action(Inventory.of(seen), PickPlaceParameters()) is not None
     # Few orientations are faster.
     few: dict[str, Any] = {"orientations": 36, "recover": True}
-    cells = load_learned_policy(None, PickPlaceParameters(), insertion=True, **few).function
-    chosen = load_policy(**few).choose(seen)
-    assert chosen.action == cells(seen)
+    cells = load_learned_policy(None, PickPlaceParameters(), insertion=True, **few)
+    chosen = next(load_policy(**few, least_confidence=0.0).choices(seen))
+    assert chosen.action == next(choose_by_networks(cells, 0.0)(seen, ())).action
     assert chosen.action.press == (high < 0.01)
     assert (chosen.confidence is None) == chosen.action.press
 
