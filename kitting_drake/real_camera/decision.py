@@ -8,10 +8,12 @@ from typing import Any
 
 from kitting_drake.policies.choices import Choice
 from kitting_drake.real_camera.calibrations.calibration import Calibration
+from kitting_drake.real_camera.checking.agreement import check_agreement
 from kitting_drake.real_camera.checking.table_check import check_table
 from kitting_drake.real_camera.checking.views import (
     CalibrationError,
     check_frames,
+    check_lenses,
     check_views,
     observe,
     seen_share,
@@ -145,9 +147,9 @@ def decide(
 ) -> BenchDecision:
     """Decides on one action, with the same heightmap and policies as the simulated cell.
 
-    The decision is to act only if the cameras see the table where it should be, pick and place are
-    visible enough, and the action is likely to succeed. With a robot, the action must also be in
-    reach: if the first one is not, actions for other objects are tried.
+    The decision is to act only if the cameras see the table where it should be and agree about what
+    is on it, pick and place are visible enough, and the action is likely to succeed. With a robot,
+    the action must also be in reach: if the first one is not, actions for other objects are tried.
 
     Args:
         frames: each camera's frame by its name.
@@ -170,7 +172,8 @@ def decide(
     seen = seen_share(observation)
     try:
         check_views(checked, calibration)
-        warnings = check_table(checked, calibration)
+        warnings = check_lenses(calibration)
+        warnings += check_table(checked, calibration) + check_agreement(checked, calibration)
     except CalibrationError as error:
         return _stopped("calibration", str(error), observation, seen, parameters)
     out_of_reach: tuple[Choice, str] | None = None

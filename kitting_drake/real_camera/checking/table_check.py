@@ -40,11 +40,15 @@ _FARTHEST = 0.35
 _LEAST = 150
 """Planes with fewer used pixels than this are ignored."""
 _BELOW = 0.5
-"""The plane at the calibrated height counts as the table if it has enough pixels: at least this
-fraction of the pixels of every plane below it. Otherwise the plane with the most pixels counts."""
+"""The plane at the calibrated height counts as the table if its weight (`TableFit.weight`) is at
+least this fraction of that of every plane below it. Otherwise the plane with the largest weight
+counts."""
 _ABOVE = 0.08
-"""The plane at the calibrated height must also have at least this fraction of the pixels of each
-plane above it. The fraction is small, because objects may hide most of a table."""
+"""The weight of the plane at the calibrated height must also be at least this fraction of that of
+each plane above it. The fraction is small, because objects may hide most of a table."""
+_SHARP = 0.004
+"""Planes with less noise than this are equally credible, in metres. A noisier one counts for less,
+because a thick layer around a plane contains many points of other surfaces."""
 _CURVED = 0.5
 """The depths are taken for distances from the camera if `_as_depth` reduces the table's noise to
 less than this fraction."""
@@ -64,6 +68,11 @@ class TableFit:
     plane: Plane
     support: int
     """The number of used pixels on the table."""
+
+    @property
+    def weight(self) -> float:
+        """How much speaks for this plane: `support`, reduced for a noisy plane (see `_SHARP`)."""
+        return self.support * _SHARP / max(self.plane.noise, _SHARP)
 
     @property
     def is_refused(self) -> bool:
@@ -132,17 +141,17 @@ def _fit(
     local = None if expected is None else _measured(expected, points, grid)
     if local is not None and (local.is_refused or local.support < _LEAST):
         local = None
-    if local is not None and local.support >= len(points) / 2:
+    if local is not None and local.weight >= len(points) / 2:
         return local
     planes = [_measured(plane, points, grid) for plane in find_planes(points)]
     if local is not None:
         others = [fit for fit in planes if abs(fit.off - local.off) > _REFUSED_OFF]
-        below = max((fit.support for fit in others if fit.off < local.off), default=0)
-        above = max((fit.support for fit in others if fit.off > local.off), default=0)
-        if local.support >= max(_BELOW * below, _ABOVE * above):
+        below = max((fit.weight for fit in others if fit.off < local.off), default=0.0)
+        above = max((fit.weight for fit in others if fit.off > local.off), default=0.0)
+        if local.weight >= max(_BELOW * below, _ABOVE * above):
             return local
     planes = [fit for fit in planes if fit.support >= _LEAST]
-    return max(planes, key=lambda fit: fit.support, default=None)
+    return max(planes, key=lambda fit: fit.weight, default=None)
 
 
 def _measured(plane: Plane, points: Array, grid: PixelGrid) -> TableFit:

@@ -25,6 +25,12 @@ _NEAREST, _FARTHEST = 0.8, 1.25
 the unit or the pose is wrong."""
 _STEP = 4
 """The step between the pixels that are checked."""
+_OBLONG = 1.1
+"""Pixels of depth cameras are square. If fx and fy differ by more than this factor, one of them is
+wrong."""
+_OFF_CENTRE = 0.05
+"""The largest usual distance of the principal point from the image's middle, as a share of the
+image's width or height."""
 _OPTICAL = np.eye(4)
 _OPTICAL[:3, :3] = Rotation.from_euler("xyz", [-90, 0, -90], degrees=True).as_matrix()
 """The pose (4, 4) of the optical frame in ROS's body frame of a camera (x forward, y left, z
@@ -67,6 +73,35 @@ def check_views(frames: Mapping[str, Frame], calibration: Calibration) -> None:
     for camera in calibration.cameras:
         _check_pose(camera, calibration.grid)
         _check_depth(frames[camera.name], camera, calibration)
+
+
+def check_lenses(calibration: Calibration) -> list[str]:
+    """Checks that the cameras' intrinsics are plausible. Those of a verified calibration are not
+    checked.
+
+    Returns:
+        Warnings, a sentence each.
+
+    Raises:
+        CalibrationError: a camera's pixels are not square.
+    """
+    warnings = []
+    for camera in () if calibration.verified else calibration.cameras:
+        lens = camera.intrinsics
+        fx, fy = lens.focal
+        if max(fx / fy, fy / fx) > _OBLONG:
+            raise CalibrationError(
+                f"camera {camera.name} has fx {fx:.0f} and fy {fy:.0f}, but pixels are square: are "
+                "both of this resolution?"
+            )
+        for axis, name in enumerate(("cx", "cy")):
+            size = lens.size[axis]
+            if abs(lens.centre[axis] + 0.5 - size / 2) > _OFF_CENTRE * size:
+                warnings.append(
+                    f"camera {camera.name} has {name} {lens.centre[axis]:.0f}, but its images are "
+                    f"{size} pixels long there: this is right only if they are cut off at one side"
+                )
+    return warnings
 
 
 def observe(frames: Mapping[str, Frame], calibration: Calibration) -> Observation:
