@@ -40,6 +40,9 @@ _RING_SEEN = 0.5
 """At least this share of the surroundings of a placed object must be seen."""
 _PLACE_SEEN = 0.25
 """At least this share of the area in which a placed object will lie must be seen."""
+_RIM_SEEN, _FLOOR_SEEN = 0.85, 0.10
+"""If at least the share `_RIM_SEEN` of the surroundings is seen, `_FLOOR_SEEN` of the area is enough.
+Seen from the side, a deep cavity's rim hides most of its floor."""
 _BLIND = 0.020
 """The radius that is assumed for an object of unknown outline, in metres."""
 
@@ -125,11 +128,11 @@ class Visibility:
         mask[tuple(there[within].T)] = True
         mask = ndimage.binary_closing(mask, iterations=2) | mask
         ring = ndimage.binary_dilation(mask, iterations=_RING) & ~mask
-        return bool(
-            (~self.in_view[mask | ring]).mean() <= _OUT_OF_VIEW
-            and self.seen[ring].mean() >= _RING_SEEN
-            and self.seen[mask].mean() >= _PLACE_SEEN
+        rim, floor = self.seen[ring].mean(), self.seen[mask].mean()
+        is_seen = (rim >= _RING_SEEN and floor >= _PLACE_SEEN) or (
+            rim >= _RIM_SEEN and floor >= _FLOOR_SEEN
         )
+        return bool(is_seen and (~self.in_view[mask | ring]).mean() <= _OUT_OF_VIEW)
 
 
 def _at(mask: Mask, positions: Array) -> Mask:

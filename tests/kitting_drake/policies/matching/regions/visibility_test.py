@@ -66,6 +66,22 @@ def test_places_need_sight_of_where_the_object_will_lie(
     assert found.place_is_seen(footprint, pick, rotation, np.array(place)) is good
 
 
+@pytest.mark.parametrize(
+    ("floor", "rim", "good"),
+    [(2, 0, True), (1, 0, True), (0, 0, False), (1, 30, False), (2, 30, True)],
+)
+def test_a_rim_that_is_seen_all_around_needs_little_of_the_floor(floor: int, rim: int, good: bool):
+    """A place of 31 x 5 pixels of which `floor` rows are seen; of the rim, `rim` columns are not."""
+    seen = np.ones(GRID.shape, bool)
+    seen[78 : 83 - floor, 100:131] = False
+    seen[72:78, 100 : 100 + rim] = False
+    found = Visibility(seen, np.ones(GRID.shape, bool), GRID.resolution)
+    rows, cols = np.mgrid[38:43, 100:131]
+    footprint = np.stack([rows, cols], axis=-1).reshape(-1, 2).astype(float)
+    pick, place = np.array([40.0, 115.0]), np.array([80.0, 115.0])
+    assert found.place_is_seen(footprint, pick, 0.0, place) is good
+
+
 def kit_and_bar(hidden: tuple[slice, slice] | None) -> Observation:
     """A kit with one recess, and the bar that belongs there; `hidden` pixels are out of view."""
     image = np.full((4, *GRID.shape), 0.5, np.float32)
