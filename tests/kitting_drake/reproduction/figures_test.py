@@ -173,6 +173,13 @@ def test_the_sentences_of_the_findings(runs: dict[str, Summary]):
         "after 100 at N = 36 and 180."
     ) in text
     assert f"it reaches {extended[0]}, {extended[1]} and {extended[2]} %." in text
+    ablation = {
+        name: f"{counts([runs[f'unseen_so2_180_100{name}']])[0] / 4:.1f}"
+        for name in ("", "_ours", "_minus_curvature", "_minus_refinement")
+    }
+    assert f"from {ablation['']} to {ablation['_ours']} %" in text
+    assert f"without them it is {ablation['_minus_curvature']} %" in text
+    assert f"refinement of the actions it is {ablation['_minus_refinement']} %" in text
     red, longer = (
         [percent(runs, f"place_red_in_green_so2_{n}_1{steps}") for n in (36, 180)]
         for steps in ("", "_3_times_the_steps")
