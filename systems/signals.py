@@ -150,7 +150,9 @@ class Observation:
 
 
 _FILL_REACH = 25
-"""A hole is filled from neighbours at most this far away, in pixels."""
+"""A narrow hole is filled from its border at most this far inwards, in pixels."""
+_SHADOW_REACH = 75
+"""A shadow is filled from pixels at most this far away, in pixels."""
 _SHADOW = np.ones((3, 3), bool)
 """A hole into which this square fits may be the shadow of an object. A narrower hole is a gap
 between points that a camera measured."""
@@ -221,7 +223,7 @@ def _fill_shadows(filled: NDArray[np.float32], shadows: NDArray[np.bool_]) -> No
         if border.any():
             low = border & (around <= around[border].min() + _HIDDEN_BELOW)
             away, nearest = ndimage.distance_transform_edt(~low, return_indices=True)
-            heights = np.where(away <= _FILL_REACH, around[tuple(nearest)], np.inf)
+            heights = np.where(away <= _SHADOW_REACH, around[tuple(nearest)], np.float32(0))
             filled[rows, cols][shadow] = heights[shadow]
 
 

@@ -189,6 +189,15 @@ def test_the_shadow_of_an_object_is_table():
     np.testing.assert_array_equal(filled[14:16, 13:15], np.float32(0.02))
 
 
+def test_a_long_shadow_is_table_to_its_end():
+    """The shadow is 40 pixels wide, and ends at the border of the image."""
+    height = np.zeros((30, 100), np.float32)
+    height[5:25, 10:30] = 0.05
+    valid = np.ones(height.shape, bool)
+    valid[:25, 30:70] = False
+    assert not fill_unseen(np.where(valid, height, 0), valid)[:, 30:].any()
+
+
 def test_the_default_is_that_everything_is_in_view():
     seen = Observation(np.zeros((4, 8, 9), np.float32), PixelGrid(rows=8, cols=9))
     assert seen.in_view.all() and not seen.valid.any()

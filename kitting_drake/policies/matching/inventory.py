@@ -111,8 +111,7 @@ class Inventory:
             return seen.free_recesses
         wanted = {id(seen.recesses[pair.recess]) for pair in self.matches}
         done = [it for it in self.memory.last if it.outcome == "placed"]
-        covers, inside = self.memory.covers, self.memory.inside
-        filled = {id(it) for it in seen.recesses if any(covers(x, it) for x in inside)}
+        filled = {id(it) for it in seen.recesses if self._is_filled(it)}
         emptied = {id(self.memory.recess_at(it.action.pick)) for it in done if it.action.aside}
         free = {id(item) for item in seen.free_recesses} | wanted | emptied
         return tuple(item for item in seen.recesses if id(item) in free - (filled - wanted))
@@ -166,7 +165,11 @@ class Inventory:
         is_tried = (free or is_proud) and any(map(self.memory.tries, self._not_placed))
         if is_missing or is_tried:
             return "gave up"
-        if not free or not seen.objects:
+        if not seen.objects:
+            return "done"
+        if not all(map(self._is_filled, seen.hidden_recesses)):
+            return "not seen"
+        if not free:
             return "done"
         if self.pairs:
             return "not sure"
@@ -177,6 +180,10 @@ class Inventory:
         """The loose objects, and those that protrude from the kit by more than `_PROUD`."""
         seen = self.segmentation
         return (*seen.objects, *(item for item in seen.protruding if item.height > _PROUD))
+
+    def _is_filled(self, recess: Region) -> bool:
+        """Whether an object was placed into a recess."""
+        return any(self.memory.covers(item, recess) for item in self.memory.inside)
 
     def pair_of(self, region: Region) -> Pair | None:
         """Returns the pair of an object and its recess; None if the object fits into no recess."""

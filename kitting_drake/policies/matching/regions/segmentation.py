@@ -173,12 +173,20 @@ class Segmentation:
             taken |= region.mask
         return np.asarray(taken)
 
+    @cached_property
+    def hidden_recesses(self) -> tuple[Region, ...]:
+        """The recesses that are wider than the gap around an object, but of which too little is
+        seen to tell whether they contain an object."""
+        wide = (item for item in self.recesses if self._is_wider_than_gaps(item))
+        return tuple(item for item in wide if not self._is_wide(item))
+
     def _is_wide(self, recess: Region) -> bool:
         """Whether a recess is seen, and wider than the gap around an object."""
-        return bool(
-            recess.inner_radius > max(_GAP, _LEAST_GAP / self.visibility.resolution)
-            and self.visibility.seen[recess.mask].mean() > _RECESS_SEEN
-        )
+        seen = self.visibility.seen[recess.mask].mean() > _RECESS_SEEN
+        return bool(seen) and self._is_wider_than_gaps(recess)
+
+    def _is_wider_than_gaps(self, recess: Region) -> bool:
+        return recess.inner_radius > max(_GAP, _LEAST_GAP / self.visibility.resolution)
 
     @cached_property
     def _low(self) -> NDArray[np.int32]:

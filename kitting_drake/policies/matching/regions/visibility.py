@@ -41,8 +41,8 @@ _RING_SEEN = 0.5
 _PLACE_SEEN = 0.25
 """At least this share of the area in which a placed object will lie must be seen."""
 _RIM_SEEN, _FLOOR_SEEN = 0.85, 0.10
-"""If at least the share `_RIM_SEEN` of the surroundings is seen, `_FLOOR_SEEN` of the area is enough.
-Seen from the side, a deep cavity's rim hides most of its floor."""
+"""If at least the share `_RIM_SEEN` of the surroundings is seen, `_FLOOR_SEEN` of the area is
+enough. Seen from the side, a deep cavity's rim hides most of its floor."""
 _BLIND = 0.020
 """The radius that is assumed for an object of unknown outline, in metres."""
 

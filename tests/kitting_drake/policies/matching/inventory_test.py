@@ -496,6 +496,20 @@ def test_an_object_that_is_only_partly_seen_does_not_fit_nowhere(column: int, re
     assert Inventory.of(scene((part, 0.015))).why_stop == reason
 
 
+def test_nothing_is_done_while_a_cavity_is_hidden_and_an_object_is_left():
+    """The rims hide most of both recesses. A box is on the table."""
+    box = np.zeros(GRID.shape, bool)
+    box[60:90, 200:240] = True
+    for objects, reason in (((box, 0.03),), "not seen"), ((), "done"):
+        seen = scene(*objects)
+        valid = np.ones(GRID.shape, bool)
+        valid[hammer(30, 35) | bar(75, 40)] = False
+        valid[:, 80:] = True
+        found = Inventory.of(dataclasses.replace(seen, valid=valid))
+        assert len(found.segmentation.hidden_recesses) == 2
+        assert found.why_stop == reason
+
+
 @pytest.mark.parametrize(("rise", "reason"), [(0.0025, "done"), (0.005, "gave up")])
 def test_an_object_that_was_pressed_and_is_hardly_proud_is_placed(rise: float, reason: str):
     history = (placed_by_policy(scene((hammer(60, 180), 0.015))),)

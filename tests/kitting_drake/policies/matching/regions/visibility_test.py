@@ -71,7 +71,7 @@ def test_places_need_sight_of_where_the_object_will_lie(
     [(2, 0, True), (1, 0, True), (0, 0, False), (1, 30, False), (2, 30, True)],
 )
 def test_a_rim_that_is_seen_all_around_needs_little_of_the_floor(floor: int, rim: int, good: bool):
-    """A place of 31 x 5 pixels of which `floor` rows are seen; of the rim, `rim` columns are not."""
+    """Of a place of 31 x 5 pixels, `floor` rows are seen; of its rim, `rim` columns are not."""
     seen = np.ones(GRID.shape, bool)
     seen[78 : 83 - floor, 100:131] = False
     seen[72:78, 100 : 100 + rim] = False
