@@ -374,7 +374,7 @@ def test_own_runs_are_consistent(own_runs: list[Run]):
     cells, others, set_aside = cell_results(own_runs, read_rates(OWN))
     assert len(cells) > 50
     assert all("+" in run.summary["commit"] for run in set_aside)
-    assert len([run for run in others if run.paper_task]) == 8
+    assert len([run for run in others if run.paper_task]) == 9
     known = [run for run in others if run.name.startswith("robust_friction")]
     assert {item for run in known for item in run.departures} == {
         "task.tries: 2",
