@@ -124,6 +124,9 @@ class Segmentation:
     and within 3 mm of its outline."""
     visibility: Visibility
     """The pixels of the observation that are seen."""
+    unseen: tuple[Region, ...] = ()
+    """The parts of the fixture's top, beside the recesses, that no camera sees. Seen from the side,
+    a slender recess may be one of them."""
     noise: float = 0.0
     """The standard deviation of the table's heights, in metres."""
 
@@ -176,8 +179,9 @@ class Segmentation:
     @cached_property
     def hidden_recesses(self) -> tuple[Region, ...]:
         """The recesses that are wider than the gap around an object, but of which too little is
-        seen to tell whether they contain an object."""
-        wide = (item for item in self.recesses if self._is_wider_than_gaps(item))
+        seen to tell whether they contain an object. Some of them may be no recess."""
+        every = (*self.recesses, *self.unseen)
+        wide = (item for item in every if self._is_wider_than_gaps(item))
         return tuple(item for item in wide if not self._is_wide(item))
 
     def _is_wide(self, recess: Region) -> bool:
@@ -261,6 +265,9 @@ def segment(observation: Observation) -> Segmentation:
     # With noise, the highest pixel is no measure of the top.
     highest = float(np.percentile(relief[fixture], 75)) if fixture.any() else 0.0
     deep = depth > max(RECESS_DEPTH, _CLEARLY * noise)
+    recesses = _regions(deep | hidden, depth, resolution, areas.recess, core=deep)
+    for region in recesses:
+        hidden &= ~region.mask
     return Segmentation(
         fixture=fixture,
         objects=tuple(
@@ -271,7 +278,7 @@ def segment(observation: Observation) -> Segmentation:
             if observation.outline_valid[item.mask].mean() > _OBJECT_SEEN
             and not _is_corner(item, fixture, relief, highest, resolution)
         ),
-        recesses=_regions(deep | hidden, depth, resolution, areas.recess, core=deep),
+        recesses=recesses,
         protruding=tuple(
             sorted(
                 _regions(rise > max(_PROTRUSION, 4 * noise), rise, resolution, areas.protruding),
@@ -281,6 +288,7 @@ def segment(observation: Observation) -> Segmentation:
         relief=relief,
         depth=depth,
         visibility=Visibility.of(observation),
+        unseen=_regions(hidden, depth, resolution, areas.recess),
         noise=_noise(relief),
     )
 

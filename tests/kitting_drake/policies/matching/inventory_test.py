@@ -510,6 +510,17 @@ def test_nothing_is_done_while_a_cavity_is_hidden_and_an_object_is_left():
         assert found.why_stop == reason
 
 
+@pytest.mark.parametrize(("is_seen", "reason"), [(True, "nothing fits"), (False, "not seen")])
+def test_an_unseen_patch_of_the_kit_may_be_a_slender_recess(is_seen: bool, reason: str):
+    box = np.zeros(GRID.shape, bool)
+    box[60:90, 200:240] = True
+    seen = scene((box, 0.03))
+    seen.image[3, bar(75, 40)] = 0.05
+    valid = np.ones(GRID.shape, bool)
+    valid[bar(75, 40)] = is_seen
+    assert Inventory.of(dataclasses.replace(seen, valid=valid)).why_stop == reason
+
+
 @pytest.mark.parametrize(("rise", "reason"), [(0.0025, "done"), (0.005, "gave up")])
 def test_an_object_that_was_pressed_and_is_hardly_proud_is_placed(rise: float, reason: str):
     history = (placed_by_policy(scene((hammer(60, 180), 0.015))),)
