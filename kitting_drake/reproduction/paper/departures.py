@@ -113,6 +113,21 @@ def departures(results: Mapping[str, Result]) -> str:
             ),
         ),
         (
+            "pick-angle network of the Equivariant Transporter",
+            "0.90 M parameters at N = 36",
+            "10.8 k",
+            _compared(
+                results,
+                "success with 103 k, as many as ours",
+                {
+                    "unseen, 100 demonstrations, N = 36": (
+                        "unseen_equivariant_transporter_36_100_every_chance",
+                        "unseen_equivariant_transporter_36_100",
+                    )
+                },
+            ),
+        ),
+        (
             "memory of failed grasps",
             "none",
             "no pick within 10 mm of a failed grasp of the same episode",
