@@ -166,7 +166,7 @@ class Inventory:
         if is_missing or is_tried:
             return "gave up"
         if not seen.objects:
-            return "done"
+            return "not seen" if free and not seen.visibility.is_whole else "done"
         if not all(map(self._is_filled, seen.hidden_recesses)):
             return "not seen"
         if not free:

@@ -10,7 +10,7 @@ from kitting_drake.reproduction.page.runs import Run
 
 FIRST_SEEDS = (
     *(73000, 82000, 85000, 86000, 92000, 94000, 96000),
-    *(100000, 102000, 104000, 106000, 108000),
+    *(100000, 102000, 104000, 106000, 108000, 117000),
 )
 """The first seeds of the runs in these tables."""
 _POLICIES = {"generalist": "generalist", "shape_matching": "shape matching", "oracle": "oracle"}

@@ -29,7 +29,7 @@ _NOT_MEASURED = (
         "15 mm thick, but cubes are 10 mm apart: jaws that open along a row push the next cube",
     ),
     ("release, in cells marked `e`", "the jaws open by 5 mm", "the jaws open by 12 mm"),
-    ("jaws before a pick, place red in green, cells marked `e`", "50 mm apart", "80 mm apart"),
+    ("jaws before a pick, in cells marked `e`", "50 mm apart (place red in green)", "80 mm apart"),
     (
         "demonstrated picks, in cells marked `e`",
         "off the object's middle, along one axis",
@@ -113,14 +113,14 @@ def departures(results: Mapping[str, Result]) -> str:
             ),
         ),
         (
-            "pick-angle network of the Equivariant Transporter",
+            "a baseline's pick-angle network",
             "0.90 M parameters at N = 36",
             "10.8 k",
             _compared(
                 results,
                 "success with 103 k, as many as ours",
                 {
-                    "unseen, 100 demonstrations, N = 36": (
+                    "Equivariant Transporter, unseen, N = 36": (
                         "unseen_equivariant_transporter_36_100_every_chance",
                         "unseen_equivariant_transporter_36_100",
                     )

@@ -20,23 +20,17 @@ ORIGINAL = {"alpha": 4_537_185, "beta": 835_888, "phi": 4_537_185, "psi": 4_537_
 _TEXT = f"""\
 #### Parameters of every network
 
-The table has the trainable parameters at N = {ORIENTATIONS}. The only picking network of the
-Transporter, f_pick, is under alpha. The *ratio* is the number of parameters of all networks,
-divided by that of the original method. For both baselines, our preset `paper` stands for the
-original.
+The table has the trainable parameters at N = {ORIENTATIONS}, and the *ratio* to those of the
+original method. The only picking network of the Transporter, f_pick, is under alpha.
 
 The presets `small` and `matched` differ in the baselines only. In both, our networks are 25 times
 smaller than the paper's. In `matched`, the Transporter is also 25 times smaller than its original,
 and the pick-angle network (beta) of the Equivariant Transporter has about as many parameters as
 ours.
 
-The parameters of the originals come from these sources:
-
-- The paper's method: counted in its authors' code.
-- The Equivariant Transporter: the paper gives 4.54 M for alpha, and phi and psi are the same U-net.
-  The authors' pick-angle network has 0.90 M at N = {ORIENTATIONS}.
-- The Transporter: the paper does not count its parameters. Our preset `paper` has the published
-  widths of its ResNets of 43 layers.
+The paper's method was counted in its authors' code. The Equivariant Transporter's paper gives
+4.54 M for alpha, and phi and psi are the same U-net; the authors' pick-angle network has 0.90 M.
+The Transporter's paper has no counts. Our preset `paper` has its widths and its 43 layers.
 """
 
 

@@ -43,6 +43,8 @@ _PLACE_SEEN = 0.25
 _RIM_SEEN, _FLOOR_SEEN = 0.85, 0.10
 """If at least the share `_RIM_SEEN` of the surroundings is seen, `_FLOOR_SEEN` of the area is
 enough. Seen from the side, a deep cavity's rim hides most of its floor."""
+_WHOLE = 0.98
+"""The workspace is whole in view if at least this share of it is in some camera's view."""
 _BLIND = 0.020
 """The radius that is assumed for an object of unknown outline, in metres."""
 
@@ -64,6 +66,11 @@ class Visibility:
         """Finds which pixels of an observation are seen."""
         grid: PixelGrid = observation.grid
         return cls(observation.valid, observation.in_view, grid.resolution)
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether the cameras' fields of view cover the workspace."""
+        return bool(self.in_view.mean() >= _WHOLE)
 
     @property
     def pickable(self) -> Mask:

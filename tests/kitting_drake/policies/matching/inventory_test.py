@@ -510,6 +510,19 @@ def test_nothing_is_done_while_a_cavity_is_hidden_and_an_object_is_left():
         assert found.why_stop == reason
 
 
+def test_an_object_for_a_free_cavity_may_lie_where_no_camera_looks():
+    placed = (placed_by_policy(scene((hammer(60, 180), 0.015))),)
+    full = dataclasses.replace(scene(filled=True), history=placed)
+    part = np.ones(GRID.shape, bool)
+    part[:, 300:] = False
+    for seen, in_view, reason in (
+        (scene(), np.ones_like(part), "done"),
+        (scene(), part, "not seen"),
+        (full, part, "done"),
+    ):
+        assert Inventory.of(dataclasses.replace(seen, in_view=in_view)).why_stop == reason
+
+
 @pytest.mark.parametrize(("is_seen", "reason"), [(True, "nothing fits"), (False, "not seen")])
 def test_an_unseen_patch_of_the_kit_may_be_a_slender_recess(is_seen: bool, reason: str):
     box = np.zeros(GRID.shape, bool)
