@@ -286,7 +286,7 @@ STOP_REASONS = {
     "done": "nothing is left to do",
     "nothing fits": "objects and free cavities are left, but none fit each other",
     "no kit seen": "no kit is seen",
-    "not seen": "too little is seen of where the robot would have to pick or place",
+    "not seen": "too little is seen to pick, to place, or to know that nothing is left to do",
     "not sure": "no pick and place is likely enough to succeed",
     "gave up": "the remaining objects could not be placed",
     "actions spent": "no actions are left",
