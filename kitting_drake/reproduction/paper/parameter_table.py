@@ -30,7 +30,7 @@ ours.
 
 The paper's method was counted in its authors' code. The Equivariant Transporter's paper gives
 4.54 M for alpha, and phi and psi are the same U-net; the authors' pick-angle network has 0.90 M.
-The Transporter's paper has no counts. Our preset `paper` has its widths and its 43 layers.
+For the Transporter, our preset `paper` stands for it, with its widths and 43 layers.
 """
 
 
